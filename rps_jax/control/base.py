@@ -91,7 +91,7 @@ def entries(name: str, leaf: Leaf) -> list[tuple[str, tuple[int, ...]]]:
 class StaticLeaf:
     """Function in parameters, as an activation of a module; it is part of the program."""
 
-    value: Any
+    value: object
 
 
 def freeze_functions(tree: Any) -> Any:

@@ -542,7 +542,7 @@ def linear_map(
     return _primitive.bind(*residuals, *vectors, **static, label=label)
 
 
-def varied_indices(tangents: Sequence[Any]) -> list[int]:
+def varied_indices(tangents: Sequence[object]) -> list[int]:
     """Return the indices of the tangents that are not zero, in a rule with `symbolic_zeros`."""
     return [i for i, x in enumerate(tangents) if not isinstance(x, SymbolicZero)]
 
@@ -559,7 +559,7 @@ def restrict(
     return restricted, [values[i] for i in indices]
 
 
-def once_differentiable(x: Any) -> Any:
+def once_differentiable(x: object) -> object:
     """Return a leaf of a pytree by which JAX refuses second derivatives."""
     is_real = isinstance(x, jax.core.Tracer) and jnp.issubdtype(x.dtype, jnp.inexact)
     return _once.bind(x, derived=False) if is_real else x

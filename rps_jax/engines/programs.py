@@ -58,7 +58,7 @@ def trace_function(
     donated = tuple(jax.tree.leaves(jax.tree.unflatten(tree, range(len(leaves)))[donate]))
     structures: list[pytree.PyTreeDef] = []  # of the results, once traced
 
-    def flat(*inputs: Any) -> list[Any]:
+    def flat(*inputs: object) -> list[object]:
         results, structure = jax.tree.flatten(function(*jax.tree.unflatten(tree, inputs)))
         structures[:] = [structure]
         return results
@@ -82,7 +82,7 @@ def trace_function(
         jitted = jax.jit(exported.call, donate_argnums=donated)
 
     @functools.cache
-    def compiled(device: Device | None) -> Callable[..., Any]:
+    def compiled(device: Device | None) -> Callable[..., object]:
         sharding = None if device is None else SingleDeviceSharding(device)
         placed = (x.update(sharding=sharding) for x in leaves)
         program = _compile_lowered(jitted.lower(*placed))

@@ -38,7 +38,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Unpack
+from typing import TYPE_CHECKING, NamedTuple, Protocol, Unpack
 
 import jax
 import numpy as np
@@ -495,7 +495,7 @@ class _SlotData:
         return _Running(slots.trials[at], inputs, trials, slots.first[at] >= launched)
 
 
-def _write(tree: Tree, index: Any, values: Tree) -> None:
+def _write(tree: Tree, index: object, values: Tree) -> None:
     """Write the rows `index` of every leaf."""
     for target, source in zip(jax.tree.leaves(tree), jax.tree.leaves(values), strict=True):
         target[index] = source

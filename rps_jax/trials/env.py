@@ -79,7 +79,7 @@ class State:
     # `world`: the World; `index`: its index in the domain; `observation`: the TaxelObservation.
     info: dict[str, Any]
 
-    def replace(self, **changes: Any) -> State:
+    def replace(self, **changes: object) -> State:
         """Return the state with other values."""
         return dataclasses.replace(self, **changes)
 

@@ -108,8 +108,8 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
         self.metadata = self.metadata | {"render_fps": round(1 / self._vector.period) or 1}
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[np.ndarray, dict[str, object]]:
         """Start in a random world, which depends on the seed; there are no `options`."""
         if options:
             raise errors.not_allowed("options", options, "this environment has none")
@@ -225,8 +225,8 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        options: dict[str, object] | None = None,
+    ) -> tuple[np.ndarray, dict[str, object]]:
         """Start in random worlds, which depend on their seeds: all, or those of a `reset_mask`."""
         device.check_process()  # not at construction, where workers cannot report an error
         for name in options or {}:
@@ -242,7 +242,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         obs, _, _, infos = self.observe()
         return obs, self._with_masks(infos, where)
 
-    def _checked_mask(self, mask: Any) -> np.ndarray:
+    def _checked_mask(self, mask: object) -> np.ndarray:
         """Return the mask (num_envs,) of the worlds to reset, by default of all."""
         if mask is None:
             return np.ones(self.num_envs, bool)

@@ -153,7 +153,7 @@ class Live:
         self._worlds = self._worlds._replace(shift=shift)
         self._continue()
 
-    def _continue(self, **changes: Any) -> None:
+    def _continue(self, **changes: object) -> None:
         """Continue a trial that has succeeded, with changes of its state."""
         success = np.zeros_like(self._trial.success)
         done = np.array(self._trial.diverged)

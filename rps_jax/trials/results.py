@@ -1,7 +1,6 @@
 """Labelled data of outcomes: a grid of trials, or one trial over time."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -55,7 +54,7 @@ def outcome_dataset(
 ) -> xr.Dataset:
     """Return outcomes (S * O * F * T, ...), nested in this order, as a dataset with `DIMS`."""
     axes = laws, objects, frictions, range(len(targets))
-    coords: dict[str, Any] = {dim: list(x) for dim, x in zip(DIMS, axes, strict=True)}
+    coords: dict[str, object] = {dim: list(x) for dim, x in zip(DIMS, axes, strict=True)}
     for name, values in zip(("target_x", "target_y"), np.asarray(targets, float).T, strict=True):
         coords[name] = "target", values, {"units": "m"}
     variables = {}

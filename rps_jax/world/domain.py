@@ -578,7 +578,7 @@ def from_json(values: JsonObject) -> Domain:
     return domain
 
 
-def _from_json(values: Mapping[str, Any], base: Domain) -> dict[str, Any]:
+def _from_json(values: Mapping[str, object], base: Domain) -> dict[str, Any]:
     """Return fields of a domain; a range without a scale has that of the `base` domain."""
     parsed = {}
     known = [f.name for f in fields(Domain)]

@@ -10,7 +10,8 @@ of one table instead, which is frozen, so that published worlds stay as they are
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any, Literal, NamedTuple, get_args
@@ -144,7 +145,7 @@ robot_slip_sideways robot_slip_yaw lookahead length turns
 turn_angle_0 turn_angle_1 turn_angle_2 turn_angle_3 turn_angle_4 turn_angle_5 turn_angle_6
 width door_width slope slope_bearing boundary_factor
 """
-_COLUMNS: Sequence[str] = _TABLE.split()
+_COLUMNS = re.findall(r"\w+", _TABLE)
 # Tasks share columns: a world has one task.
 _SHARED = {"route": "turn_angle_6", "scale": "width"}
 _INDICES = {x: _COLUMNS.index(_SHARED.get(x, x)) for x in (*_COLUMNS, *_SHARED)}

@@ -163,7 +163,7 @@ class Task:
         `object_width` loads models.
         """
 
-    def measures(self, course: Any) -> Arrays:
+    def measures(self, course: object) -> Arrays:
         """Return quantities (n,) of courses that the drawn numbers do not tell, by name."""
         return {}
 
