@@ -113,11 +113,12 @@ def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
     shell = world.skin.shell
     sizes = {"half_length": shell.half[0], "half_width": shell.half[1], "base_radius": shell.radius}
     for name, value in sizes.items():
-        attrs = {"units": "m", "long_name": f"{name.replace('_', ' ')} of the base"}
+        meaning = f"{name.replace('_', ' ')} of the base"
         if value is not None:
-            variables[name] = xr.Variable((), float(value), attrs)
-    attrs = {"units": "m", "long_name": "outline of the object in its own frame"}
-    variables["outline"] = xr.Variable(("corner", "axis"), _outline(world.footprint), attrs)
+            variables |= labelled(**{name: ((), float(value), "m", meaning)})
+    meaning = "outline of the object in its own frame"
+    shape = ("corner", "axis"), _outline(world.footprint)
+    variables |= labelled(outline=(*shape, "m", meaning))
     return xr.Dataset(variables, coords={"time": ("time", snapshots.time, {"units": "s"})})
 
 

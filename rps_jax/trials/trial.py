@@ -216,11 +216,8 @@ def object_pose(qpos: Float[Array, "10"]) -> tuple[Vector, Float[Array, ""]]:
 @jax.jit
 def p_world_contact(snapshots: Snapshot) -> Float[Array, "T 2"]:
     """Return the contact points of snapshots (T, ...) in the world [m]; NaN without contact."""
-    qpos, reading = snapshots.qpos, snapshots.reading
-    point = qpos[:, JOINTS.base_position] + planar.rotate(
-        qpos[:, JOINTS.base_yaw], reading.p_robot_contact
-    )
-    return jnp.where((reading.contact_type != NONE)[:, None], point, jnp.nan)
+    point = contact_of(snapshots.qpos, snapshots.reading.p_robot_contact)
+    return jnp.where((snapshots.reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
 def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
@@ -263,9 +260,12 @@ def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
     return fp.place(world.footprint, p_robot_object, object_yaw - yaw)
 
 
-def contact_of(qpos: Float[Array, "10"], p_robot_contact: Vector) -> Vector:
+def contact_of(
+    qpos: Float[Array, "*B 10"], p_robot_contact: Float[Array, "*B 2"]
+) -> Float[Array, "*B 2"]:
     """Return a contact point in the world [m]."""
-    return qpos[JOINTS.base_position] + planar.rotate(qpos[JOINTS.base_yaw], p_robot_contact)
+    turned = planar.rotate(qpos[..., JOINTS.base_yaw], p_robot_contact)
+    return qpos[..., JOINTS.base_position] + turned
 
 
 def positions_of(
