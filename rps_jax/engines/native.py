@@ -30,7 +30,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +42,7 @@ from jax.interpreters import ad, batching, mlir
 
 from rps_jax.engines import device
 from rps_jax.geometry import vectors
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu import WARP, GpuWriter
 from rps_jax.lowering.graph import CompilerError, TooLargeError, UnsupportedError, first_array
@@ -51,7 +52,6 @@ from rps_jax.record import cache
 if TYPE_CHECKING:
     from rps_jax.engines.base import Stage
 
-Pytree: TypeAlias = Any  # of arrays; functions of this module take any
 Function: TypeAlias = Callable[..., Pytree]
 # XLA, too, fuses a sum with the product before it. No other optimisation may change results.
 _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
@@ -188,7 +188,7 @@ def mapped(function: Function, axes: Sequence[int | None]) -> Function:
         trees = list(map(jax.tree.structure, arguments))
 
         # Records check the shapes of a world: a batch is passed as leaves.
-        def single(*leaves: Sequence[Any]) -> Pytree:
+        def single(*leaves: Sequence[Pytree]) -> Pytree:
             return function(*(tree.unflatten(x) for tree, x in zip(trees, leaves, strict=True)))
 
         inputs = [
@@ -222,12 +222,12 @@ def scan(
     count = len(jax.tree.leaves(state))
 
     def run(values: list[jax.Array], varied: Collection[int] | None = None) -> Pytree:
-        groups: dict[Any, list[int]] = {}  # of the state, then of the constants
+        groups: dict[tuple[object, ...], list[int]] = {}  # of the state, then of the constants
         for i, x in enumerate(values):
             key = i >= count, x.dtype, i >= count and i in (varied or ())
             groups.setdefault(key, []).append(i)
         carried = sum(not is_constant for is_constant, *_ in groups)
-        restore: Any = [ravel_pytree([values[i][0] for i in x])[1] for x in groups.values()]
+        restore: Pytree = [ravel_pytree([values[i][0] for i in x])[1] for x in groups.values()]
 
         def packed(leaves: Sequence[jax.Array], indices: Sequence[list[int]]) -> list[jax.Array]:
             return [ravel_pytree([leaves[i] for i in x])[0] for x in indices]
@@ -253,7 +253,7 @@ def scan(
         end = jax.vmap(lambda x: unpacked(x, indices[:carried]))(end)
         return jax.tree.structure(state).unflatten(end), outputs
 
-    def rule(primals: Any, tangents: Any) -> Any:
+    def rule(primals: Pytree, tangents: Pytree) -> Pytree:
         ((values,), (directions,)) = primals, tangents
         indices = varied_indices(directions)
         of_varied, point = restrict(functools.partial(run, varied=indices), values, indices)
@@ -281,15 +281,15 @@ def _tangents(
     varied = varied_indices(directions)
     real = [i for i, x in enumerate(result_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-    def real_results(values: Sequence[Any]) -> list[Any]:
+    def real_results(values: Sequence[Pytree]) -> list[Pytree]:
         leaves = jax.tree.leaves(function(*tree.unflatten(values)))
         return [leaves[i] for i in real]
 
-    def push(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
+    def push(values: Sequence[Pytree], vectors: Sequence[Pytree]) -> list[Pytree]:
         of_varied, point = restrict(real_results, values, varied)
         return jax.jvp(of_varied, (point,), (list(vectors),))[1]
 
-    def pull(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
+    def pull(values: Sequence[Pytree], vectors: Sequence[Pytree]) -> list[Pytree]:
         of_varied, point = restrict(real_results, values, varied)
         return jax.vjp(of_varied, point)[1](list(vectors))[0]
 
@@ -305,7 +305,7 @@ def concurrent(
     functions: Sequence[Function],
     fallback: Callable[..., Sequence[Pytree]],
     sort_by: Callable[..., jax.Array] | None = None,
-) -> Callable[..., Any]:
+) -> Callable[..., Pytree]:
     """Return functions of batches of worlds as one function; a GPU runs them at the same time.
 
     Args:
@@ -319,7 +319,9 @@ def concurrent(
         return fallback
 
     @functools.cache
-    def compiled(types: Sequence[tuple[Any, Sequence[Any]]]) -> tuple[list[_Function], Any]:
+    def compiled(
+        types: Sequence[tuple[Pytree, Sequence[Pytree]]],
+    ) -> tuple[list[_Function], Pytree]:
         calls = [_Function(f, *x, sort_by) for f, x in zip(functions, types, strict=True)]
         groups = [calls] if jax.default_backend() == "gpu" else [[call] for call in calls]
         return calls, [(group, _compiled(group)) for group in groups]
@@ -337,7 +339,7 @@ def concurrent(
             inputs = [[*x, order] for x, order in zip(inputs, orders, strict=True)]
         flat_inputs, inputs_tree = jax.tree.flatten(inputs)
 
-        def run_libraries(values: Sequence[Any], _: Any) -> list[jax.Array]:
+        def run_libraries(values: Sequence[Pytree], _: Pytree) -> list[jax.Array]:
             """Call the libraries, for which it waits until they are compiled."""
             leaves = inputs_tree.unflatten(values)
             try:
@@ -388,8 +390,8 @@ class _Function:
     def __init__(
         self,
         function: Function,
-        tree: Any,
-        types: Sequence[tuple[Any, Any]],
+        tree: Pytree,
+        types: Sequence[tuple[Pytree, Pytree]],
         sort_by: Callable[..., jax.Array] | None,
     ) -> None:
         self.inputs = [jax.ShapeDtypeStruct(shape[1:], dtype) for shape, dtype in types]
@@ -514,16 +516,16 @@ def _register(name: str, body: bytes) -> bool:
 # --- linear maps ---------------------------------------------------------------------------------
 
 # Of residuals (on which the map depends) and of vectors: tuples of arrays.
-Map: TypeAlias = Callable[[Sequence[Any], Sequence[Any]], Sequence[jax.Array]]
+Map: TypeAlias = Callable[[Sequence[Pytree], Sequence[Pytree]], Sequence[jax.Array]]
 Maps: TypeAlias = tuple[Map, Map | None]
 
 
 def linear_map(
     forward: Map,
     transpose: Map | None,
-    residuals: Sequence[Any],
-    vectors: Sequence[Any],
-    like: Any,
+    residuals: Sequence[Pytree],
+    vectors: Sequence[Pytree],
+    like: Pytree,
     label: str = "",
 ) -> list[jax.Array]:
     """Return `forward(residuals, vectors)`, linear in the vectors, with a given transpose.
@@ -548,11 +550,11 @@ def varied_indices(tangents: Sequence[object]) -> list[int]:
 
 
 def restrict(
-    function: Callable[[list[Any]], Any], values: Sequence[Any], indices: Sequence[int]
-) -> tuple[Callable[[list[Any]], Any], list[Any]]:
+    function: Callable[[list[Pytree]], Pytree], values: Sequence[Pytree], indices: Sequence[int]
+) -> tuple[Callable[[list[Pytree]], Pytree], list[Pytree]]:
     """Return a function of some entries of its list, the others constant, and these entries."""
 
-    def restricted(entries: list[Any]) -> Any:
+    def restricted(entries: list[Pytree]) -> Pytree:
         replaced = dict(zip(indices, entries, strict=True))
         return function([replaced.get(i, x) for i, x in enumerate(values)])
 
@@ -570,14 +572,16 @@ _primitive.multiple_results = True
 
 
 @_primitive.def_impl
-def _run(*arrays: Any, maps: Maps, count: int, **_: Any) -> list[jax.Array]:
+def _run(*arrays: Pytree, maps: Maps, count: int, **_: object) -> list[jax.Array]:
     return list(maps[0](arrays[:count], arrays[count:]))
 
 
 _primitive.def_abstract_eval(lambda *_, outs, **__: outs)
 
 
-def _transpose(cotangents: Any, *arrays: Any, maps: Maps, count: int, outs: Any, label: str) -> Any:
+def _transpose(
+    cotangents: Pytree, *arrays: Pytree, maps: Maps, count: int, outs: Pytree, label: str
+) -> Pytree:
     vectors = [
         jnp.zeros(out.shape, out.dtype) if isinstance(x, ad.Zero) else x
         for x, out in zip(cotangents, outs, strict=True)
@@ -589,7 +593,9 @@ def _transpose(cotangents: Any, *arrays: Any, maps: Maps, count: int, outs: Any,
     return [None] * count + moved
 
 
-def _batch(arrays: Any, axes: Any, *, maps: Maps, count: int, outs: Any, label: str) -> Any:
+def _batch(
+    arrays: Pytree, axes: Pytree, *, maps: Maps, count: int, outs: Pytree, label: str
+) -> Pytree:
     size = next(x.shape[i] for x, i in zip(arrays, axes, strict=True) if i is not None)
     whole = [
         jnp.broadcast_to(x, (size, *x.shape)) if i is None else jnp.moveaxis(x, i, 0)
@@ -601,7 +607,7 @@ def _batch(arrays: Any, axes: Any, *, maps: Maps, count: int, outs: Any, label: 
     return results, [0] * len(outs)
 
 
-def _refuse(*_: Any, **__: Any) -> Any:
+def _refuse(*_: object, **__: Pytree) -> Pytree:
     raise NotImplementedError(
         "trials have no second derivatives: differentiate once, or take differences of gradients."
     )
@@ -613,7 +619,7 @@ batching.primitive_batchers[_primitive] = _batch
 mlir.register_lowering(_primitive, mlir.lower_fun(_run, multiple_results=True))
 
 
-def _jvp_once(primals: Any, tangents: Any, derived: bool) -> tuple[jax.Array, Any]:
+def _jvp_once(primals: Pytree, tangents: Pytree, derived: bool) -> tuple[jax.Array, Pytree]:
     return _refuse() if derived else (_once.bind(*primals, derived=True), *tangents)
 
 

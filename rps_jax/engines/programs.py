@@ -18,7 +18,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -27,6 +27,7 @@ from jax.sharding import SingleDeviceSharding
 
 from rps_jax.control.base import Law
 from rps_jax.engines import native
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.record import cache
 
 if TYPE_CHECKING:
@@ -34,13 +35,13 @@ if TYPE_CHECKING:
 
 
 def trace_function(
-    function: Callable[..., Any],
-    arguments: Sequence[Any],
+    function: Callable[..., Pytree],
+    arguments: Sequence[Pytree],
     *,
     law: Law,
     donate: int,
     static: Sequence[object],
-) -> Callable[[Device | None], Callable[..., Any]]:
+) -> Callable[[Device | None], Callable[..., Pytree]]:
     """Trace a function for arguments of some shapes, or load its program from the cache.
 
     Args:
@@ -191,7 +192,7 @@ def _path_of(inputs: str) -> Path | None:
     return Path(folder) / "traced" / key
 
 
-def _read(path: Path, leaves: Sequence[Any]) -> tuple[pytree.PyTreeDef, export.Exported] | None:
+def _read(path: Path, leaves: Sequence[Pytree]) -> tuple[pytree.PyTreeDef, export.Exported] | None:
     """Return a cached program and the structure of its results, if it fits these arguments."""
 
     def parse(body: bytes) -> tuple[pytree.PyTreeDef, export.Exported]:

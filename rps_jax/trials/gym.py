@@ -15,7 +15,7 @@ processes must be spawned, since JAX hangs in a forked one: `gymnasium.make_vec(
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -40,6 +40,7 @@ try:
 except ImportError as error:
     raise errors.not_installed("gymnasium", "gym") from error
 
+Infos = dict[str, Any]
 _SEEDS = 2**32  # of one word of a key
 
 
@@ -117,14 +118,14 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
         obs, info = self._vector.reset(seed=seed)
         return obs[0], self._info(info)
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Infos]:
         """Execute an action (3,), or (2,) on a base that cannot move sideways."""
         *results, infos = self._vector.step([action])
         obs, reward, terminated, truncated = (values[0] for values in results)
         return obs, float(reward), bool(terminated), bool(truncated), self._info(infos)
 
     @staticmethod
-    def _info(infos: Mapping[str, Any]) -> dict[str, Any]:
+    def _info(infos: Infos) -> Infos:
         """Return the infos of the only world that it has, without masks."""
         return {name: infos[name][0].item() for name in infos if infos.get(f"_{name}", [False])[0]}
 
@@ -270,9 +271,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._keys = keys if self._keys is None else jnp.where(known & where, keys, self._keys)
 
     @device.standard_jax()
-    def step(
-        self, actions: Any
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Execute actions (num_envs, 3), or (num_envs, 2)."""
         device.check_process()
         mode = self.metadata["autoreset_mode"]
@@ -312,7 +311,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return tuple(self.push_env.render([rows(self.state, i) for i in range(self.num_envs)]))
 
     @staticmethod
-    def _with_masks(infos: Mapping[str, Any], where: np.ndarray) -> dict[str, Any]:
+    def _with_masks(infos: Infos, where: np.ndarray) -> Infos:
         """Return infos, each with the mask of the worlds that have it; none has NaN."""
         masks = {
             name: where & ~np.isnan(x) if np.asarray(x).dtype.kind == "f" else where.copy()

@@ -21,6 +21,7 @@ from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
 from rps_jax.geometry import solid
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
@@ -63,8 +64,8 @@ class WorldBatch(NamedTuple):
 
     indices: np.ndarray  # (n,) indices of the trials in the run
     worlds: World  # leaves (n, ...), on the host
-    stage: Any  # a `Stage`, or the models of an engine outside of JAX
-    params: Any = ()  # `LawParams` with leaves (n, ...), on the host; () if not yet known
+    stage: Pytree  # a `Stage`, or the models of an engine outside of JAX
+    params: Pytree = ()  # `LawParams` with leaves (n, ...), on the host; () if not yet known
 
     def with_params(self, params: LawParams) -> WorldBatch:
         """Return the trials with the same law parameters in every world."""

@@ -23,7 +23,7 @@ from jax.ad_checkpoint import checkpoint_name
 from rps_jax.engines.fused.contacts import Body, Contact, Point, State
 from rps_jax.engines.native import restrict, varied_indices
 from rps_jax.geometry import vectors as sp
-from rps_jax.geometry.arrays import Number
+from rps_jax.geometry.arrays import Number, Pytree
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.geometry.vectors import Vec
 from rps_jax.robot.base import Tyres
@@ -234,7 +234,7 @@ def accelerations(
         problem, solution = rebuilt(arrays)
         return _minimise(problem, physics) if solution is None else list(solution)
 
-    def rule(primals: Any, tangents: Any) -> tuple[list[Vec], list[Vec]]:
+    def rule(primals: Pytree, tangents: Pytree) -> tuple[list[Vec], list[Vec]]:
         (arrays,), (directions,) = primals, tangents
         x = checkpoint_name(run(arrays), SOLUTION)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ from rps_jax.engines.fused.contacts import (
 from rps_jax.engines.fused.newton import SOLUTION, Base, Problem, accelerations, wrench_on_base
 from rps_jax.geometry import solid
 from rps_jax.geometry import vectors as sp
-from rps_jax.geometry.arrays import Entries
+from rps_jax.geometry.arrays import Entries, Pytree
 from rps_jax.geometry.vectors import Vec
 from rps_jax.robot.base import Tyres, push
 from rps_jax.robot.robot import Robot
@@ -166,10 +166,10 @@ class FusedStage(NamedTuple):
         compiled, and so are the derivatives; elsewhere XLA compiles it.
         """
 
-        def steps(*inputs: Any) -> Driven:
+        def steps(*inputs: Pytree) -> Driven:
             return _drive(*inputs, physics=period.physics, force=period.force)
 
-        def with_solutions(inputs: Any, solutions: Any) -> tuple[Driven, Any]:
+        def with_solutions(inputs: Pytree, solutions: Pytree) -> tuple[Driven, Pytree]:
             driven = steps(*inputs, solutions)
             return driven._replace(solutions=None), driven.solutions
 
@@ -184,7 +184,7 @@ def _drive(
     motion: Motion,
     twist: Vec,
     robot: Robot | None,
-    solutions: Any = None,
+    solutions: Pytree = None,
     *,
     physics: Physics,
     force: bool,
