@@ -264,8 +264,8 @@ def contact_of(
     qpos: Float[Array, "*B 10"], p_robot_contact: Float[Array, "*B 2"]
 ) -> Float[Array, "*B 2"]:
     """Return a contact point in the world [m]."""
-    turned = planar.rotate(qpos[..., JOINTS.base_yaw], p_robot_contact)
-    return qpos[..., JOINTS.base_position] + turned
+    position, yaw = qpos[..., JOINTS.base_position], qpos[..., JOINTS.base_yaw]
+    return position + planar.rotate(yaw, p_robot_contact)
 
 
 def positions_of(
