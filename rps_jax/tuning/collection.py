@@ -253,7 +253,7 @@ def _act_together(
 
         carry = batch.states, touch_state, jnp.zeros_like(batch.earned)
         steps = round(network.hold / env.dt)
-        (state, touch_state, reward), _ = jax.lax.scan(step, carry, length=steps)
+        state, touch_state, reward = jax.lax.scan(step, carry, length=steps)[0]
         memory = batch.memory._replace(
             touch_state=touch_state, hidden=jnp.zeros(()), action=bounded
         )
