@@ -262,7 +262,10 @@ def step(
 
     # D1, and the guess D9 after an approach that passes M without contact.
     p_world_contact = obs.p_world_robot + planar.rotate(yaw, contact)
-    middle = p_world_contact + params.r * planar.unit(yaw + normal)
+    ahead, last = params.r * planar.unit(yaw + normal), state.p_world_object - p_world_contact
+    is_steady = or_(state.pushed, not_(state.touched))
+    ahead = planar.direction(where(is_steady, ahead, ahead + last))
+    middle = p_world_contact + params.r * planar.unit(ahead)
     middle = where(touches, middle, state.p_world_object)
     t_lost = where(touches, 0.0, state.t_lost + obs.period)
     pushed, is_new = and_(push, or_(state.pushed, touches)), not_(state.pushed)
@@ -309,8 +312,8 @@ def step(
     is_corner = above(contact[0], half_length - _CORNER, length)
     stops = and_(and_(touches, is_corner), or_(not_(hits), spent))
     arrives = or_(hits, stops)
-    gap = jnp.sum((p_world_contact - front) * u)
-    is_clear = above(gap, params.back, length)
+    clearance = planar.norm(p_world_contact - obs.p_world_robot) - half_length
+    is_clear = above(clearance, params.back, length)
     stopped = and_(_either(state.around, state.align), stops)
     retreat = _either(is_finished, stopped, and_(state.retreat, not_(is_clear)))
     leaves = and_(state.retreat, is_clear)
@@ -330,7 +333,7 @@ def step(
     drive = where(is_large, on_spot, -v_max * jnp.cos(error))
     v = where(around, drive, where(touched, v_max, params.v_approach))
     v = where(align, on_spot, where(retreat, -v_max, v))
-    omega = where(align, face, where(around, error, where(retreat, 0.0, steer)))
+    omega = where(align, face, where(or_(around, retreat), error, steer))
     omega = jnp.clip(omega, -jnp.asarray(params.omega_max), params.omega_max)
     bound = planar.safe_sqrt(jnp.maximum(v_max**2 - (axle * omega) ** 2, 1e-8))
     v = jnp.clip(v, -bound, bound)
