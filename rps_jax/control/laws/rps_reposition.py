@@ -10,7 +10,8 @@ its push and the notation of `unicycle` (D1, D2):
 
 While stuck, the base moves at v_max towards W, straight away from M where it is nearer than R, and
 from the last W to M. It always turns to face M, omega = angle of M - P minus theta. The next touch
-on the way to M starts RPS+ afresh. It senses what RPS+ senses.
+on the way to M starts RPS+ afresh. After an approach that passes M without a touch, M is a point
+ahead and aside, since dead taxels may have pushed the object along. It senses what RPS+ senses.
 """
 
 from typing import Annotated, NamedTuple
