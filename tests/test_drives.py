@@ -309,6 +309,31 @@ def test_a_touch_on_the_way_is_a_push_a_retreat_or_moves_the_circle(name):
     assert not state.align
 
 
+def test_a_touch_on_the_way_moves_the_middle_less_than_one_in_a_push():
+    contact, params = np.array([0.3625, -0.28]), unicycle.UnicycleParams()
+    known = contact + np.array([0.0, params.r])
+    steps = (
+        stepped(contact, True, touched=True, p_world_object=known, **{k: True})[0]
+        for k in ("around", "pushed")
+    )
+    angles = [np.arctan2(*(np.asarray(x.p_world_object) - contact)[::-1]) for x in steps]
+    np.testing.assert_allclose(angles, [math.pi / 4, 0.0], atol=1e-5)
+
+
+def test_the_base_turns_while_it_retreats():
+    params = unicycle.UnicycleParams()
+    start = unicycle.init(params)._replace(
+        **{k: jnp.asarray(True) for k in ("touched", "retreat")},
+        p_world_object=jnp.array([0.6, 0.0]),
+        p_world_contact=jnp.array([0.37, 0.0]),
+    )
+    obs = observation([0.0, 0.0], 0.0, [0.0, 0.0], False, [0.6, 3.0])._replace(axle=0.0)
+    state, twist, _ = unicycle.step(params, start, obs)
+    assert state.retreat
+    assert twist.v_x == -np.float32(params.v_max)
+    assert abs(twist.omega) == np.float32(params.omega_max)
+
+
 @pytest.mark.parametrize(
     ("misses", "offset", "expected"),
     [(0, 0.1, "contact"), (1, 0.1, "ahead"), (1, 0.28, "beside"), (2, 0.1, "beside")],

@@ -71,7 +71,7 @@ class Drives(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
     """Names of domains."""
     worlds: int = option(10000, 2, 10_000_000)
     """Number of worlds of each domain."""
-    setting: Setting = field(default=Setting("fused", seed=9029), kw_only=True)
+    setting: Setting = field(default=Setting("fused", seed=8123), kw_only=True)
 
     @cached_property
     def plans(self) -> dict[str, Plan]:

@@ -10,7 +10,8 @@ its push and the notation of `unicycle` (D1, D2):
 
 While stuck, the base moves at v_max towards W, straight away from M where it is nearer than R, and
 from the last W to M. It always turns to face M, omega = angle of M - P minus theta. The next touch
-on the way to M starts RPS+ afresh. It senses what RPS+ senses.
+on the way to M starts RPS+ afresh. After an approach that passes M without a touch, M is a point
+ahead and aside, since dead taxels may have pushed the object along. It senses what RPS+ senses.
 """
 
 from typing import Annotated, NamedTuple
@@ -29,6 +30,7 @@ from rps_jax.geometry.arrays import Number, Parameter
 from rps_jax.spec import Bound, Spec, document
 
 _AHEAD = 1.26  # [rad] by which the base aims ahead on the circle
+_ASIDE = 0.5  # [rad] of the next guess of M beside the heading of an approach that missed
 _ARRIVED, _CLEAR = 0.1, 0.1  # [m] errors at the staging point, and of the circle
 
 
@@ -114,6 +116,8 @@ def step(
     is_finished = approach & touches
     front = base + half_length * planar.unit(yaw)
     missed = approach & (jnp.sum((front - middle) * planar.unit(yaw)) > params.r)
+    ahead = front + params.r * planar.unit(yaw + _ASIDE * way.side)
+    middle = jnp.where(missed, ahead, middle)
     approach, away = approach & ~is_finished & ~missed, away & ~is_finished
 
     heading = planar.direction(jnp.where(approach, middle, way.aim) - base)

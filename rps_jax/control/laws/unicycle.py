@@ -8,7 +8,8 @@ at most. So the law leaves the object when its contact is spent, drives around i
 It remembers the last contact C and the object's middle M in the world. T is the target, theta the
 heading, u(x) the unit vector at an angle x, and A the axle, a behind the base's middle.
 
-  D1  M = C + r u(theta + n), with n the direction of the base's normal at the contact
+  D1  M = C + r u(theta + n), with n the direction of the base's normal at the contact; for a touch
+      outside of a push, u points along the sum of r u(theta + n) and the last M - C
   D2  psi = direction of T - M; the opposite if |T - M| < r and the base stands beyond M
   D3  e = angle of T - C minus theta;  x_C: of C ahead of the axle
 
@@ -18,9 +19,10 @@ Push at v_max until the contact is lost for t_lost, or spent: it leaves the fron
   D4  omega = K_e e + K_l (l - l_dead sgn l where |l| > l_dead, else 0)
   D5  omega = K_near v_max sin(e) / x_C   within d_near;  0 without contact
 
-Retreat straight, until C is `back` ahead of the front. Drive around M in reverse, so that the base
-need not turn away from the object and back. With phi the angle of A - M, and turn the angle from
-phi to psi + pi, which decides the side:
+Retreat at v_max with the omega of D7, until C is `back` farther from the base's middle than its
+front is: a front that turns while it retreats passes an even face. Drive around M in reverse, so
+that the base need not turn away from the object and back. With phi the angle of A - M, and turn the
+angle from phi to psi + pi, which decides the side:
 
   D6  W = M - (R_s + a) u(psi)  where turn < carrot,  else  M + (R + a) u(phi +- carrot)
   D7  omega = angle of A - W minus theta,  v = -v_max cos(omega)
@@ -105,7 +107,7 @@ class UnicycleParams(NamedTuple):
         Parameter,
         Spec("s", "without contact until it is lost", gt=0, tune=Bound(0.2, 8, log=True)),
     ] = 0.3644
-    back: Annotated[Parameter, Spec("m", "retreat", ge=0, tune=Bound(0.01, 0.6))] = 0.02443
+    back: Annotated[Parameter, Spec("m", "way of a retreat", ge=0, tune=Bound(0.01, 0.6))] = 0.1
     carrot: Annotated[
         Parameter, Spec("rad", "aim ahead on the circle, D6", gt=0, tune=Bound(0.4, 1.5))
     ] = 1.124
@@ -114,7 +116,7 @@ class UnicycleParams(NamedTuple):
     ] = 0.95
     R_s: Annotated[
         Parameter, Spec("m", "distance of the last W from M, D6", gt=0, tune=Bound(0.4, 1.4))
-    ] = 0.7
+    ] = 0.85
 
 
 class Widths(NamedTuple):
@@ -262,7 +264,10 @@ def step(
 
     # D1, and the guess D9 after an approach that passes M without contact.
     p_world_contact = obs.p_world_robot + planar.rotate(yaw, contact)
-    middle = p_world_contact + params.r * planar.unit(yaw + normal)
+    ahead, last = params.r * planar.unit(yaw + normal), state.p_world_object - p_world_contact
+    is_steady = or_(state.pushed, not_(state.touched))
+    ahead = planar.direction(where(is_steady, ahead, ahead + last))
+    middle = p_world_contact + params.r * planar.unit(ahead)
     middle = where(touches, middle, state.p_world_object)
     t_lost = where(touches, 0.0, state.t_lost + obs.period)
     pushed, is_new = and_(push, or_(state.pushed, touches)), not_(state.pushed)
@@ -309,8 +314,8 @@ def step(
     is_corner = above(contact[0], half_length - _CORNER, length)
     stops = and_(and_(touches, is_corner), or_(not_(hits), spent))
     arrives = or_(hits, stops)
-    gap = jnp.sum((p_world_contact - front) * u)
-    is_clear = above(gap, params.back, length)
+    clearance = planar.norm(p_world_contact - obs.p_world_robot) - half_length
+    is_clear = above(clearance, params.back, length)
     stopped = and_(_either(state.around, state.align), stops)
     retreat = _either(is_finished, stopped, and_(state.retreat, not_(is_clear)))
     leaves = and_(state.retreat, is_clear)
@@ -330,7 +335,7 @@ def step(
     drive = where(is_large, on_spot, -v_max * jnp.cos(error))
     v = where(around, drive, where(touched, v_max, params.v_approach))
     v = where(align, on_spot, where(retreat, -v_max, v))
-    omega = where(align, face, where(around, error, where(retreat, 0.0, steer)))
+    omega = where(align, face, where(or_(around, retreat), error, steer))
     omega = jnp.clip(omega, -jnp.asarray(params.omega_max), params.omega_max)
     bound = planar.safe_sqrt(jnp.maximum(v_max**2 - (axle * omega) ** 2, 1e-8))
     v = jnp.clip(v, -bound, bound)
@@ -356,36 +361,36 @@ _TUNED = UnicycleParams()
 PRESETS = {
     "unicycle": _TUNED,
     "unicycle_car": _TUNED._replace(
-        r=0.09363,
-        K_e=1.341,
-        K_l=7.964,
-        l_dead=0.1695,
-        l_edge=0.3247,
-        d_near=0.2774,
-        e_near=2.405,
-        K_near=1.359,
-        t_lost=0.2291,
-        back=0.01655,
-        carrot=1.19,
-        e_far=3.2,
-        R=0.9113,
-        R_s=1.1,
+        r=0.09525,
+        K_e=1.304,
+        K_l=7.918,
+        l_dead=0.1664,
+        l_edge=0.3328,
+        e_far=3.054,
+        d_near=0.2219,
+        e_near=2.412,
+        K_near=1.121,
+        t_lost=0.2308,
+        back=0.01371,
+        carrot=1.155,
+        R=1.082,
+        R_s=0.988,
     ),
     "unicycle_round": _TUNED._replace(
-        r=0.2088,
-        K_e=2.067,
-        K_l=4.204,
-        l_dead=0.2045,
-        l_edge=0.2063,
-        d_near=0.3938,
-        e_near=2.133,
-        K_near=2.303,
-        t_lost=1.861,
-        back=0.01947,
-        carrot=1.419,
-        e_far=3.2,
-        R=0.9152,
-        R_s=0.9152,
+        r=0.2154,
+        K_e=0.698,
+        K_l=4.354,
+        l_dead=0.1978,
+        l_edge=0.2193,
+        e_far=3.122,
+        d_near=0.4278,
+        e_near=2.09,
+        K_near=2.425,
+        t_lost=2.194,
+        back=0.15,
+        carrot=1.385,
+        R=0.9212,
+        R_s=0.9204,
     ),
     "unicycle_front": _TUNED._replace(
         r=0.2494,
