@@ -25,7 +25,6 @@ import scipy
 import xarray as xr
 
 from rps_jax import RPSParams, Rules, Setting, errors, evaluate
-from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.control import registry
 from rps_jax.questions import Picture, Run, call_of, option
@@ -37,13 +36,17 @@ from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.run import Tuning
 from sweeps.study_base import Parts, Study, Table, part_name
 
-TABLES = "sweeps/gradients/tables.py"  # from the root of the repository
-# Options of tunings by the number of tuned parameters: those of RPS, or the entries of tables.
+FOLDER, DRUMS = "sweeps/gradients", ("random_cylinder",)  # from the root of the repository
+# Options of tunings by the number of tuned parameters: those of RPS or RPS+, the entries of tables,
+# or the weights of a learned law.
 COUNTS: dict[int, dict[str, Any]] = {
     6: {"tuned": ("K_h", "K_v", "L", "beta", "l_cr", "d_th")},
     13: {"tuned": ("full",)},
-    **{n: {"law": f"{TABLES}:Table{n}", "objects": ("random_cylinder",)} for n in (64, 512, 2048)},
+    18: {"law": "rps_plus", "domain": ("hostile",), "robot": "kairos", "objects": ("random_box",)},
+    **{n: {"law": f"{FOLDER}/tables.py:Table{n}", "objects": DRUMS} for n in (64, 512, 2048)},
+    16515: {"law": f"{FOLDER}/weights.py:Weights", "domain": ("hostile",), "objects": DRUMS},
 }
+SCORES = "success", "score"  # of a trial in a test world
 FIRST = "derivatives"  # method with which the others are compared
 _LARGE = 500  # parameters from which evolution has a diagonal covariance
 _QUICK = {"worlds": 4, "validation": 4, "objects": ("random_cylinder",)}
@@ -137,9 +140,9 @@ METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
 class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     """Race derivatives, slopes and evolution: equal simulated time and equal wall time.
 
-    The answer has the `success` (count, seed, method, budget, world) of the tuned laws in test
-    worlds, and that of the law at the start, `start_success` (count, world). Budgets are `wall` or
-    `simulated` with an amount [s].
+    The answer has `success` and `score` (count, seed, method, budget, world) of the tuned laws in
+    test worlds, and those of the law at the start, `start_success` and `start_score` (count,
+    world). Budgets are `wall` or `simulated` with an amount [s].
     """
 
     TITLE: ClassVar[str] = "Derivatives against evolution"
@@ -159,14 +162,15 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     methods: tuple[str, ...] = tuple(METHODS)
     """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials) or evolution."""
-    counts: tuple[int, ...] = tuple(COUNTS)
-    """Numbers of tuned parameters: 6 and 13 of RPS, or the 64, 512 and 2,048 entries of tables."""
+    counts: tuple[int, ...] = (6, 13, 64, 512, 2048)
+    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, 64, 512 and 2048
+    entries of tables, or 16515 weights of a learned law."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
     simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
     """Budgets of simulated time [s]; a differentiated second counts as four. After the largest no
     generation starts."""
-    wall: tuple[float, ...] = option((10.0, 30.0), above=0, unit="s")
+    wall: tuple[float, ...] = option((), above=0, unit="s")
     """Budgets of wall time without compilation [s]."""
     worlds: int = option(400, 1, 1_000_000)
     """Number of test worlds of `wide`."""
@@ -223,8 +227,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         _, firsts, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
         chosen = [law_of(best[at], start) for at in firsts]
         options = {"split": "test", "setting": self.setting, "progress": False}
-        scores = evaluate([start, *chosen], domain, self.worlds, **options)
-        start_success, *tuned = scores.success.values.astype(np.int8)
+        robot = COUNTS[count].get("robot")
+        scores = evaluate([start, *chosen], domain, self.worlds, robot=robot, **options)
         dims, shape = ("seed", "method"), (len(self.seeds), len(self.methods))
         by_tuning = {
             "generations": [len(curve) for curve in curves],
@@ -235,16 +239,14 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
         }
         variables = {name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()}
-        success = np.array(tuned)[inverse.ravel()].reshape(*shape, len(budgets), -1)
+        for name in SCORES:
+            first, *tuned = scores[name].values.astype(np.float32)
+            by_budget = np.array(tuned)[inverse.ravel()].reshape(*shape, len(budgets), -1)
+            variables[f"start_{name}"] = ("world", first)
+            variables[name] = ((*dims, "budget", "world"), by_budget)
         names = [f"{name} {amount:g} s" for name, amount in budgets]
-        return xr.Dataset(
-            variables
-            | {
-                "start_success": ("world", start_success),
-                "success": ((*dims, "budget", "world"), success),
-            },
-            {"seed": list(self.seeds), "method": list(self.methods), "budget": names},
-        )
+        coords = {"seed": list(self.seeds), "method": list(self.methods), "budget": names}
+        return xr.Dataset(variables, coords)
 
     def intro(self, results: xr.Dataset) -> str:
         """Return the budgets."""
@@ -267,8 +269,13 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
                 "format": "{:+.1f} points",
                 "rest": " [{:+.1f}, {:+.1f}]",
             },
+            {"name": "objective", "format": "{:.3f}"},
+            {
+                "name": "derivatives lower by",
+                "format": "{:+.3f}",
+                "rest": " [{:+.3f}, {:+.3f}]",
+            },
             {"name": "by seed"},
-            {"name": "gained, lost"},
             {"name": "generations"},
         ]
         text = "Square brackets: 95 % intervals over the seeds, by Student's t."
@@ -297,8 +304,8 @@ def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
 def problem(count: int) -> tuple[Any, str]:
     """Return the law at the start and the domain of the test worlds of a problem."""
     _, start = registry.parse_law(COUNTS[count].get("law", "rps"))
-    objects = COUNTS[count].get("objects", ())
-    return start, ",".join(["wide", *(f"objects={name}" for name in objects)])
+    (domain,), objects = COUNTS[count].get("domain", ("wide",)), COUNTS[count].get("objects", ())
+    return start, ",".join([domain, *(f"objects={name}" for name in objects)])
 
 
 def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:
@@ -329,22 +336,29 @@ def table(results: xr.Dataset) -> list[list[Any]]:
     rows: list[list[Any]] = []
     for count, budget in itertools.product(results["count"].values, results.budget.values):
         of_count = results.sel(count=count)
-        start = of_count.start_success
         if budget == results.budget.values[0]:
-            rows.append([str(count), "", "start", 100 * float(start.mean()), None, "", "", ""])
-        means = 100 * of_count.success.sel(budget=budget).mean("world")
-        for method in map(str, results.method.values):
-            chosen = of_count.sel({"method": method})  # `method` is an argument of `sel`
-            values, ahead = means.sel({"method": method}).values, None
-            if method != FIRST and FIRST in means.method:
-                ahead = interval(means.sel({"method": FIRST}).values - values)
-            compared = [statistics.compare(start, x) for x in chosen.success.sel(budget=budget)]
-            gained, lost = (sum(getattr(c, x) for c in compared) for x in ("gained", "lost"))
-            seeds = ", ".join(f"{x:.1f}" for x in values)
-            counts = f"+{gained} -{lost}", f"{float(chosen.generations.mean()):.0f}"
-            name, amount, unit = str(budget).split()
+            success, score = (float(of_count[f"start_{x}"].mean()) for x in SCORES)
+            rows.append([str(count), "", "start", 100 * success, None, score, None, "", ""])
+        means = of_count[[*SCORES]].sel(budget=budget).mean("world").transpose("method", "seed")
+        by_method = dict(
+            zip(map(str, means.method.values), 100 * means.success.values, strict=True)
+        )
+        scores = dict(zip(by_method, means.score.values, strict=True))
+        name, amount, unit = str(budget).split()
+        for method, success in by_method.items():
+            ahead = lower = None
+            if method != FIRST and FIRST in by_method:
+                ahead, lower = (
+                    interval(by_method[FIRST] - success),
+                    interval(scores[method] - scores[FIRST]),
+                )
+            seeds = ", ".join(f"{x:.1f}" for x in success)
+            generations = of_count.generations.sel(
+                {"method": method}
+            ).mean()  # an argument of `sel`
             label = f"{name} time, {float(amount):,g} {unit}"
-            rows.append([str(count), label, method, interval(values), ahead, seeds, *counts])
+            cells = [interval(success), ahead, float(scores[method].mean()), lower, seeds]
+            rows.append([str(count), label, method, *cells, f"{float(generations):.0f}"])
     return rows
 
 
