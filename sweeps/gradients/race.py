@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import itertools
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -27,13 +27,16 @@ import xarray as xr
 from rps_jax import RPSParams, Rules, Setting, errors, evaluate
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.control import registry
+from rps_jax.control.base import entries
 from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.runs.evaluate import Candidates, CandidateScores, score_candidates
 from rps_jax.runs.question import SimulationQuestion
 from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
+from rps_jax.tuning.learn import Learn
 from rps_jax.tuning.run import Tuning
+from sweeps.gradients.weights import changes_of
 from sweeps.study_base import Parts, Study, Table, part_name
 
 FOLDER, DRUMS = "sweeps/gradients", ("random_cylinder",)  # from the root of the repository
@@ -115,7 +118,9 @@ class _Paced(Tuning):
         return xr.Dataset()
 
 
-class _Grad(_Paced, TuneGrad):
+class PacedGrad(_Paced, TuneGrad):
+    """`rps tune grad` that shares its programs with others."""
+
     @functools.cached_property
     def _programs(self) -> dict[Callable[..., Any], Any]:
         return self.pool.programs
@@ -129,10 +134,35 @@ class _ES(_Paced, TuneES):
     pass
 
 
-METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
-    "derivatives": (_Grad, {"steps": 16}),
+def timed(limit: float) -> type[Run]:
+    """Return runs that begin no generation after some wall clock [s]."""
+
+    class Timed(Run):
+        """Run with a limit."""
+
+        def steps(self, compute: Any, proceed: Any, **options: Any) -> Iterator[xr.Dataset]:
+            spent = 0.0
+            steps = super().steps(compute, lambda i: proceed(i) and spent < limit, **options)
+            for results in steps:
+                spent += float(results.run)
+                yield results
+
+    return Timed
+
+
+METHODS: dict[str, tuple[type[Any], dict[str, Any]]] = {
+    "derivatives": (PacedGrad, {"steps": 16}),
     "slopes": (_ES, {"estimator": "antithetic", "worlds": 128, "generations": 10}),
     "evolution": (_ES, {"worlds": 32, "population": 16, "generations": 1000}),
+    # As `learned_small` was learned, for one shape in one domain.
+    "PPO": (
+        Learn,
+        {
+            **{"network": "mlp", "initial": "learned_small", "action_std": 0.2},
+            **{"learning_rate": 2e-4, "prioritised": 0.5, "anneal": 0.4, "ema_updates": 100},
+            **{"num_envs": 64, "drawn": 1024, "minutes": 0.0, "success": 2.0, "failure": 1.0},
+        },
+    ),
 }
 
 
@@ -160,8 +190,9 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     DIMENSION: ClassVar[str] = "count"
     REPORTS_TIMES: ClassVar[bool] = True
 
-    methods: tuple[str, ...] = tuple(METHODS)
-    """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials) or evolution."""
+    methods: tuple[str, ...] = (FIRST, "slopes", "evolution")
+    """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials), evolution, or PPO
+    for the weights of a learned law, up to the largest budget of simulated time."""
     counts: tuple[int, ...] = (6, 13, 64, 512, 2048)
     """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, 64, 512 and 2048
     entries of tables, or 16515 weights of a learned law."""
@@ -169,7 +200,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     """Seeds of the tunings."""
     simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
     """Budgets of simulated time [s]; a differentiated second counts as four. After the largest no
-    generation starts."""
+    generation starts; without any, those of wall time limit the tunings."""
     wall: tuple[float, ...] = option((), above=0, unit="s")
     """Budgets of wall time without compilation [s]."""
     worlds: int = option(400, 1, 1_000_000)
@@ -191,32 +222,39 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             n: partial(self._compete, run.folder or Path(str(self.out)), n) for n in self.counts
         }
 
-    def tuning(self, seed: int, count: int, method: str) -> Tuning:
+    def tuning(self, seed: int, count: int, method: str) -> Tuning | Learn:
         """Return a tuning of the race."""
         kind, options = METHODS[method]
+        setting, budget = replace(self.setting, seed=seed), max(self.simulated, default=0.0)
+        if kind is Learn:
+            _, domain = problem(count)
+            update = options["num_envs"] * Learn.num_steps * Learn.hold  # [s] of simulated time
+            return Learn((domain,), updates=round(budget / update), **options, setting=setting)
         diagonal = {"estimator": "sep_cma"} if method == "evolution" and count >= _LARGE else {}
         sizes = _QUICK if self.quick else {}
-        limits = {"validation": 64, "budget": max(self.simulated)}
-        setting = replace(self.setting, seed=seed)
+        limits = {"validation": 64, "budget": budget}
         return kind(**{**COUNTS[count], **limits, **options, **diagonal, **sizes}, setting=setting)
 
     def _compete(self, folder: Path, count: int) -> xr.Dataset:
         """Run the tunings of a count, and test their best laws within each budget."""
         labels = list(itertools.product(self.seeds, (count,), self.methods))
         folders = [folder / part_name(*label) for label in labels]
-        pool = Lockstep(len(labels))
+        questions = [self.tuning(*label) for label in labels]
+        pool = Lockstep(sum(isinstance(x, Tuning) for x in questions))
+        limited = timed(np.inf if self.simulated else max(self.wall))
 
-        def run(question: Tuning, at: Path) -> pd.DataFrame:
-            try:
+        def run(question: Tuning | Learn, at: Path) -> pd.DataFrame:
+            at.mkdir(exist_ok=True)
+            if isinstance(question, Learn):
                 question.answer(Run(at, no_progress))
+                return learned_curve(at)
+            try:
+                object.__setattr__(question, "pool", pool)
+                question.answer(limited(at, no_progress))
                 return pd.read_csv(at / "curve.csv")
             finally:
                 pool.leave()
 
-        questions = [self.tuning(*label) for label in labels]
-        for question, at in zip(questions, folders, strict=True):
-            object.__setattr__(question, "pool", pool)
-            at.mkdir(exist_ok=True)
         with ThreadPoolExecutor(len(labels)) as threads:
             curves = list(threads.map(run, questions, folders))
         budgets = [(name, amount) for name in BUDGETS for amount in getattr(self, name)]
@@ -299,6 +337,20 @@ def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
     """Return the generation with the best validation within a budget."""
     within = curve[spent(curve, budget) <= amount]
     return within.iloc[int(np.nanargmin(within.validation))]
+
+
+def learned_curve(folder: Path) -> pd.DataFrame:
+    """Return the start and the end of PPO as two generations of a tuning of the weights."""
+    curve, changes = pd.read_csv(folder / "curve.csv"), changes_of(folder / "policy.npz")
+    names = registry.named_leaves({"params": {"weights": changes}})
+    ends = [{name: np.zeros_like(x) for name, x in names.items()}, names]
+    rows = [
+        {label: x[at] for name, x in leaves.items() for label, at in entries(name, x)}
+        for leaves in ends
+    ]
+    last = curve.iloc[-1]
+    spent = {"run": [last.time - curve.time[0], 0.0], "simulated": [last.simulated, 0.0], "validation": [1.0, 0.0]}
+    return pd.DataFrame(rows).assign(**spent)
 
 
 def problem(count: int) -> tuple[Any, str]:

@@ -6,6 +6,7 @@ rps tune grad --law sweeps/gradients/weights.py:Weights
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +27,12 @@ class Weights(NamedTuple):
     d_success: float = 0.05
     v_max: float = 0.05
     omega_max: float = 0.15
+
+
+def changes_of(path: Path) -> dict[str, np.ndarray]:
+    """Return the changes of the weights [1] of the file of a policy."""
+    weights = policy.read(str(path)).weights
+    return {name: weights[name] - x for name, x in _POLICY.weights.items()}
 
 
 def step(params: Weights, state: Any, obs: Any) -> Any:
