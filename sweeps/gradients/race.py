@@ -349,8 +349,8 @@ def learned_curve(folder: Path) -> pd.DataFrame:
         for leaves in ends
     ]
     last = curve.iloc[-1]
-    spent = {"run": [last.time - curve.time[0], 0.0], "simulated": [last.simulated, 0.0], "validation": [1.0, 0.0]}
-    return pd.DataFrame(rows).assign(**spent)
+    spent = {"run": [last.time - curve.time[0], 0.0], "simulated": [last.simulated, 0.0]}
+    return pd.DataFrame(rows).assign(**spent, validation=[1.0, 0.0])
 
 
 def problem(count: int) -> tuple[Any, str]:
