@@ -108,8 +108,7 @@ def value_and_grad(
     solution of each physics step. Where contacts, cones or rules switch they are one-sided, and
     jumps of the score are not in them. Pushes are chaotic: with time fewer gradients predict the
     effect of a small change. `useful` is the share of some worlds in which they do. Law and skin
-    have their smooth forms by default, so that what the law feels has derivatives. Where a step of
-    the engine quasistatic has not converged, they err by some 1e-3.
+    have their smooth forms by default, so that what the law feels has derivatives.
 
     Args:
       score: function of the `Trajectory` (T, ...) of one trial and of `args`, which returns one
@@ -595,6 +594,8 @@ def _notes(
     """Yield sentences on coordinates whose derivatives are zero, not finite or of no use."""
     if invalid := np.sum(~np.isfinite(value)):
         yield f"The score is not finite in {invalid} of {value.size} trials."
+    if engine == "quasistatic":
+        yield "Gradients of quasistatic err by up to 1e-3 where a step has not converged."
     is_mass = np.array([x.name == "mass" and not x.is_parameter for x in coordinates])
     is_mass &= not domain.weakest.driven
     if is_mass.any():
