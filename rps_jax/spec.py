@@ -13,6 +13,7 @@ import functools
 import inspect
 import math
 import re
+import sys
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -172,6 +173,14 @@ def spec_of(annotation: Any) -> Spec | None:
     return dataclasses.replace(spec, **limits) if limits else spec
 
 
+def _texts_of(kind: type) -> Mapping[str, Any]:
+    if sys.version_info < (3, 14):
+        return inspect.get_annotations(kind)
+    import annotationlib  # pyright: ignore[reportMissingImports]
+
+    return annotationlib.get_annotations(kind, format=annotationlib.Format.STRING)
+
+
 @functools.cache
 def _annotations_of(kind: type) -> dict[str, Any]:
     """Return the annotations of a class.
@@ -181,9 +190,7 @@ def _annotations_of(kind: type) -> dict[str, Any]:
     try:
         return typing.get_type_hints(kind, include_extras=True)
     except (NameError, AttributeError, TypeError) as error:
-        texts = [
-            str(x) for base in kind.__mro__ for x in vars(base).get("__annotations__", {}).values()
-        ]
+        texts = [str(x) for base in kind.__mro__ for x in _texts_of(base).values()]
         if any("Annotated[" in text for text in texts):
             sentence = f"the annotations of {kind.__name__} cannot be evaluated: {error}."
             raise errors.InputError(sentence) from error

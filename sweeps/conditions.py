@@ -25,7 +25,6 @@ from rps_jax.trials.progress import Progress, SequentialProgress
 from rps_jax.trials.pushes import Cases
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.world import paper
-from rps_jax.world.scene import Friction
 from rps_jax.worlds import Case, parse_domain
 from sweeps.study_base import TrialStudy, part_of, stored_parts
 
@@ -38,7 +37,7 @@ class Grid(NamedTuple):
 
     laws: tuple[str, ...] = ("rps",)
     objects: tuple[str, ...] = parse_domain("paper").objects
-    friction: Mapping[str, Friction] = FRICTION
+    friction: Mapping[str, Any] = FRICTION
     targets: tuple[tuple[float, float], ...] = paper.TARGETS
 
     @property

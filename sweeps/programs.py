@@ -14,14 +14,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rps_jax import Range, RPSParams, Setting
+from rps_jax import Range, RPSParams, Setting, draw_worlds
 from rps_jax.laws import LawParams
 from rps_jax.physics import FRICTION, preset
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.trial import ControlLoop, Trial, World
-from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import draws, paper
+from rps_jax.world import paper
 from rps_jax.worlds import Case, parse_domain
 
 FAMILIES = ("box", "cylinder", "prism")
@@ -40,11 +38,10 @@ BATCHED = {
 }
 
 
-def timed_worlds(family: str, count: int, setting: Setting) -> WorldBatch:
+def timed_worlds(family: str, count: int, setting: Setting) -> Any:
     """Return worlds with boxes, cylinders or prisms at the paper's targets under S1."""
     if family == "prism":
-        drawn = draws.draw(_PRISMS, 0, np.arange(count))
-        return drawn_worlds(_PRISMS, drawn, setting).with_params(RPSParams.paper())
+        return draw_worlds(_PRISMS, count, setting=setting).with_params(RPSParams.paper())
     targets = paper.TARGETS
     cases = [Case(family, FRICTION["S1"], targets[i % len(targets)], gap=0) for i in range(count)]
     return pushes.build(cases, setting)
@@ -88,7 +85,8 @@ def traced(
     physics = setting.physics
     cases = timed_worlds(family, len(paper.TARGETS), setting)
     indices = np.arange(worlds) % len(paper.TARGETS)
-    batch, params = jax.device_put(rows((cases.worlds, cases.params), indices))
+    inputs = jax.tree.map(lambda x: x[indices], (cases.worlds, cases.params))
+    batch, params = jax.device_put(inputs)
     start = trial.start_all(batch, params, np.ones(worlds, bool))
     shared, steps = stage(cases.stage), round(simulated / physics.control_period)
 

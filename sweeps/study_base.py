@@ -26,7 +26,8 @@ import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax import InputError, errors
+from rps_jax import InputError, Setting, errors
+from rps_jax.laws import resolve_law
 from rps_jax.questions import Picture, Plan, Run, Section
 from rps_jax.record import options, provenance
 from rps_jax.runs import execution
@@ -35,6 +36,7 @@ from rps_jax.runs.results import PlanRequest, Results
 from rps_jax.trials.batch_run import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.trials.trial import Outcome
+from rps_jax.worlds import DomainLike, parse_domain
 from sweeps import probes, render_tables
 
 T = TypeVar("T", covariant=True)
@@ -94,6 +96,13 @@ def text_table(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) ->
     """
     texts = [[form.format(**row) for form in columns.values()] for row in rows]
     return [list(columns), *(["" if re.search(r"\bnan\b", x) else x for x in row] for row in texts)]
+
+
+def median_interval(values: np.ndarray, resamples: int = 2000) -> tuple[float, float, float]:
+    """Return the median of values (n,) and its 95 % interval by a bootstrap."""
+    drawn = np.random.default_rng(0).choice(values, (resamples, values.size))
+    low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
+    return float(np.median(values)), float(low), float(high)
 
 
 # --- studies --------------------------------------------------------------------------------
@@ -202,6 +211,19 @@ class PlanStudy(Question[T]):
     def num_trials(self) -> int | None:
         """Return the number of trials."""
         return sum(plan.num_trials for plan in self.plans.values())
+
+
+def plan_of(
+    law: str,
+    domain: DomainLike,
+    worlds: int,
+    setting: Setting,
+    robot: str | None = None,
+    task: str | None = None,
+) -> Plan:
+    """Return the plan of a law in worlds of a domain, with a robot and a task."""
+    ranges = parse_domain(domain, robot, task)
+    return Plan(ranges, worlds, dict([resolve_law(law)]), setting.with_robot(ranges.robot))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,11 +3,8 @@
 A table is equal to the reference, or is refused with words that the sentence must contain.
 """
 
-import bz2
 import gzip
 import io
-import lzma
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -67,9 +64,7 @@ class Case(NamedTuple):
 
 def text(change: Change = lambda t: t, encoding: str = "utf-8", **options: Any) -> Any:
     """Return the content of the table that pandas writes."""
-    return lambda: (
-        change(push()).to_csv(index=options.pop("index", False), **options).encode(encoding)
-    )
+    return lambda: change(push()).to_csv(index=False, **options).encode(encoding)
 
 
 def lines(edit: Callable[[list[str]], list[str]], newline: str = "\n", **options: Any) -> Any:
@@ -106,15 +101,6 @@ def cell(row: int, column: str, value: object) -> Change:
     return change
 
 
-def zipped(name: str = "log.csv") -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(name, text()())
-        if name.startswith("xl/"):
-            archive.writestr("xl/styles.xml", "")
-    return file.getvalue()
-
-
 def savetxt(**options: Any) -> bytes:
     file = io.BytesIO()
     np.savetxt(file, push().to_numpy(), **options)
@@ -146,7 +132,6 @@ CASES: dict[str, Case] = {
     "semicolons": Case(text(sep=";")),
     "bars": Case(text(sep="|")),
     "blanks": Case(lambda: push().to_string(index=False).encode(), suffix=".txt"),
-    "comma and blank": Case(lines(lambda rows: [row.replace(",", ", ") for row in rows])),
     "decimal commas after tabs": Case(text(sep="\t", decimal=",")),
     "decimal commas in quotes": Case(text(decimal=",")),
     "quotes": Case(text(quoting=1)),
@@ -160,28 +145,13 @@ CASES: dict[str, Case] = {
     "numpy.savetxt": Case(lambda: savetxt(header=" ".join(TITLES)), suffix=".dat"),
     "numpy.savetxt without header": Case(lambda: savetxt(delimiter=","), "has no header"),
     "sep= of Excel": Case(lines(lambda rows: ["sep=;", *rows], sep=";", decimal=",")),
-    "named index": Case(text(index=True, index_label="step")),
-    "row names of R": Case(
-        lines(
-            lambda rows: [rows[0], *(f'"{i}" {row}' for i, row in enumerate(rows[1:], 1))],
-            sep=" ",
-            quoting=2,
-        )
-    ),
     "trailing commas below": Case(lines(lambda rows: [rows[0], *(r + "," for r in rows[1:])])),
     "additional columns": Case(text(lambda t: t.assign(note="a, b", battery=np.nan))),
-    "order": Case(text(lambda t: t[t.columns[::-1]])),
     "capitals": Case(text(CAPITALS)),
     "surrounding blanks": Case(lines(lambda rows: [r.replace(",", " , ") for r in rows])),
-    "minus sign": Case(lines(lambda rows: [r.replace("-", "\N{MINUS SIGN}") for r in rows])),
     "gzip, upper suffix": Case(lambda: gzip.compress(text()()), suffix=".CSV.GZ"),
-    "bzip2": Case(lambda: bz2.compress(text()()), suffix=".csv.bz2"),
-    "xz": Case(lambda: lzma.compress(text()()), suffix=".csv.xz"),
-    "zip": Case(zipped, suffix=".csv.zip"),
     "cut gzip": Case(lambda: gzip.compress(text()())[:900], "cannot be unpacked", suffix=".csv.gz"),
-    "Excel by name": Case(
-        lambda: zipped("xl/workbook.xml"), "save its sheet as CSV", suffix=".xlsx"
-    ),
+    "Excel by name": Case(lambda: b"PK\3\4", "save its sheet as CSV", suffix=".xlsx"),
     "another suffix": Case(text(), "give a trace, a run folder of rps push, a", suffix=".json"),
     "Excel's error in the first cell": Case(
         text(cell(7, "time", "#N/A")), "row 9, column time, but '#N/A'"
@@ -290,16 +260,10 @@ CASES: dict[str, Case] = {
     "thousands": Case(
         text(cell(7, "x", "1,234.5")), "row 9, column x, but '1,234.5': write a number as 1234.5"
     ),
-    "thousands, whole": Case(
-        text(lambda t: t.assign(time=[f"{round(1e3 * s):,}" for s in t.time])),
-        "row 52, column time, but '1,000' and 349 more",
-        "time=time[ms]",
-    ),
     "cut file": Case(lambda: text()()[:-40], "row 401, column contact_y, but an empty"),
     "long row": Case(
         lines(lambda rows: [*rows[:8], rows[8] + ",5", *rows[9:]]), "has 13 cells in row 9"
     ),
-    "header repeated": Case(lines(lambda rows: rows + rows), "row 402, column time, but 'time'"),
     "kind of contact": Case(text(lambda t: t.assign(contact_type=3)), "contact_type = 3 in row 2"),
     # Times.
     "ISO date-times": Case(text(stamps("%Y-%m-%dT%H:%M:%S.%f%z"))),
@@ -333,16 +297,12 @@ CASES: dict[str, Case] = {
     "yaw and omega in degrees, almost straight": Case(
         lambda: straight(50.0).to_csv(index=False).encode(), "yaw may be in deg"
     ),
-    "yaw and omega in degrees": Case(text(scaled(yaw=DEG, omega=0.5 * DEG)), "yaw may be in deg"),
     "omega in degrees": Case(text(scaled(omega=DEG)), "omega may be in deg/s"),
     "position in mm": Case(text(scaled(x=MM, y=MM)), "x and y may be in mm"),
     "speed in mm/s": Case(text(scaled(v_x=MM)), "v_x and v_y may be in mm/s"),
     "all lengths in mm": Case(
         text(scaled(x=10, y=10, v_x=10, contact_x=MM, contact_y=MM)),
         "contact_x and contact_y may be in mm",
-    ),
-    "contact in cm": Case(
-        text(scaled(contact_x=100, contact_y=100)), "contact_y may be in mm or cm"
     ),
     "target in mm": Case(
         text(scaled(target_x=MM)), "target_x and target_y up to 2000 m, beyond the limit of 100"
@@ -354,9 +314,6 @@ CASES: dict[str, Case] = {
     "force in mN": Case(text(known_object(force_x=-3e4)), "force_x and force_y up to 3e[+]04 N"),
     "object in mm": Case(
         text(known_object(object_x=-600)), "object_x and object_y up to 600 m, beyond"
-    ),
-    "object in degrees": Case(
-        text(known_object(object_yaw=45.0)), "object_yaw up to 45 rad, beyond"
     ),
     "turning object in degrees": Case(
         text(lambda t: known_object()(t).assign(object_yaw=DEG * (t.yaw - 2.9))),

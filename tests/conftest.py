@@ -7,6 +7,7 @@ import signal
 from importlib import metadata
 from pathlib import Path
 
+import graph_verifier
 import pytest
 import shapes
 import tolerances
@@ -60,10 +61,9 @@ def pytest_configure(config):
     import jax
 
     from rps_jax.engines import device
-    from rps_jax.lowering import verifier
     from rps_jax.world import rendering
 
-    verifier.enabled = True
+    graph_verifier.install()
 
     rendering.choose_gl()
     device.configure_xla()

@@ -310,6 +310,16 @@ def _is_module(address: str) -> bool:
     return path.is_dir() or path.with_suffix(".py").exists()
 
 
+def docstrings() -> list[str]:
+    """Return the docstrings of the package."""
+    return [
+        ast.get_docstring(node) or ""
+        for path in (ROOT / "rps_jax").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+    ]
+
+
 # --- comparisons ---------------------------------------------------------------------------
 
 

@@ -162,7 +162,7 @@ def test_the_motor_does_not_resist_a_sideways_velocity_and_the_tyres_stop_it():
     inertia = np.diag([robot.mass, robot.mass, robot.inertia])
     held = inertia + tyres.mass * np.outer(tyres.sideways, tyres.sideways)
     velocity = np.array([0.0, 0.05, 0.0]) + 0.01 * np.linalg.solve(held, tyres.force)
-    assert abs(velocity @ tyres.sideways) < 5e-5
+    assert abs(velocity @ tyres.sideways) < 1e-4
 
 
 def test_an_action_for_an_axle_is_two_numbers():

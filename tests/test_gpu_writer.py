@@ -16,7 +16,7 @@ from test_native import OPERATIONS, advanced, build_push, close, same
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry import vectors
 from rps_jax.lowering import nvrtc
-from rps_jax.lowering.gpu_writer import GPU_HEADER, GpuWriter
+from rps_jax.lowering.gpu import GPU_HEADER, GpuWriter
 from rps_jax.trials import trial
 from rps_jax.world.domain import Range
 

@@ -1,6 +1,5 @@
 """The library as a user calls it: labelled data, the same as on the command line."""
 
-import ast
 import doctest
 import inspect
 import pkgutil
@@ -9,9 +8,9 @@ import pytest
 import xarray as xr
 from helpers import (
     PAPER,
-    ROOT,
     SLOTS,
     addresses,
+    docstrings,
     rps,
     setting_of,
 )
@@ -153,14 +152,8 @@ def test_every_public_function_has_an_example():
 
 
 def test_every_example_of_the_package_is_run():
-    docstrings = [
-        ast.get_docstring(node) or ""
-        for path in (ROOT / "rps_jax").rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-    ]
     parse = doctest.DocTestParser().get_examples
-    lines = {x.source for text in docstrings for x in parse(text)}
+    lines = {x.source for text in docstrings() for x in parse(text)}
     run = [x for name in PUBLIC for test in examples(name) for x in test.examples]
     assert lines == {x.source for x in run}
     assert not any(doctest.SKIP in x.options for x in run)

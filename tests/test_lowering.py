@@ -19,14 +19,14 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive
 from test_gpu_writer import Emulated
 
 from rps_jax.engines import device, native
-from rps_jax.lowering import c, js, operations, target, walk
+from rps_jax.lowering import c, graph, js, operations, walk
 from rps_jax.lowering.builder import SimdBuilder
 from rps_jax.lowering.compounds import COMPOUNDS
-from rps_jax.lowering.gpu_writer import GpuWriter
+from rps_jax.lowering.gpu import GpuWriter
+from rps_jax.lowering.graph import UnsupportedError
 from rps_jax.lowering.onnx import Graph, Tensor
 from rps_jax.lowering.routine import routine
-from rps_jax.lowering.simd_writer import SimdWriter
-from rps_jax.lowering.target import UnsupportedError
+from rps_jax.lowering.writer import SimdWriter
 
 MAKE = runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))  # with the printer of a page
 REALS = [0.0, -0.0, 0.5, -1.5, 2.5, 7.0, 1e30, -1e30, np.inf, -np.inf, np.nan]
@@ -442,7 +442,7 @@ def primitive_names(jaxpr):
 
 
 def test_each_primitive_of_jax_that_the_compiler_knows_has_a_case():
-    known = {*COMPOUNDS, *walk._MOVES, *walk._IDENTITIES, *target.REDUCTIONS}
+    known = {*COMPOUNDS, *walk._MOVES, *walk._IDENTITIES, *graph.REDUCTIONS}
     known |= {operation.rpartition("_")[0] for operation in {*SimdBuilder.operations, *COMPOUNDS}}
     primitives = {x.name for x in vars(lax).values() if isinstance(x, Primitive)}
     closed, *_ = jaxpr([*CASES, *generated()])

@@ -121,7 +121,7 @@ def test_derivatives_of_1_and_100_steps_of_a_box_on_a_plane_are_central_differen
         product, x = matrix @ product, box.ours(x[None])[0]
         if i in (0, 99):
             expected = differences(box.theirs, start, steps=i + 1)
-            atol = 1e-3 * np.abs(expected).max()
+            atol = 2e-3 * np.abs(expected).max()
             assert_allclose(product, expected, rtol=0, atol=atol)
     assert np.linalg.norm(x[7:9]) > 0.1  # it still slides
 

@@ -14,7 +14,7 @@ from rps_jax import Details, Law, Twist, replay, sweep
 from rps_jax.control import registry
 from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod
-from rps_jax.lowering import builder, compounds, passes, walk
+from rps_jax.lowering import builder, compounds, walk, writer
 from rps_jax.trials import law_check, trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop
@@ -349,7 +349,7 @@ def test_xla_compiles_other_functions_and_the_reason_is_named_once(name, recwarn
         assert reason in str(warning.message)
 
 
-@pytest.mark.parametrize("owner", [builder, passes])
+@pytest.mark.parametrize("owner", [builder, writer.Writer])
 def test_an_error_of_the_compiler_itself_is_raised(owner, monkeypatch):
     """A fault of a builder or a pass must not make a run ten times slower in silence."""
     name = "walk" if owner is builder else "_next_group"

@@ -181,13 +181,13 @@ def ends_at(half, y, tilt=0.0, dead=(), gap=0.0005, skin=CapacitiveSkin()):
     return skins.ends_of(jnp.asarray(signal), jnp.asarray(alive), Shell(), skin.threshold)
 
 
-def test_the_ends_of_a_flush_face_are_within_a_fifth_of_a_taxel():
+def test_the_ends_of_a_flush_face_are_within_a_third_of_a_taxel():
     for half in np.linspace(0.09, 0.16, 7):
         for y in np.linspace(-0.07, 0.07, 9):
             found = ends_at(half, y)
             assert found.seen.all()
             assert found.even
-            assert_allclose(found.ends, [y + half, y - half], atol=0.01)
+            assert_allclose(found.ends, [y + half, y - half], atol=0.016)
 
 
 def test_an_end_beyond_the_front_is_not_seen():

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 import shutil
+import tomllib
 from dataclasses import replace
 from fnmatch import fnmatch
 
@@ -20,7 +21,7 @@ from rps_jax.record import files
 from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import Rules
 from sweeps import probes, render_tables
-from sweeps.publish import dependencies, rows, study
+from sweeps.publish import rows, study
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.random_worlds import million
 from sweeps.speed import study as speed
@@ -282,17 +283,13 @@ def test_rare_failures_have_rows_of_the_median_and_of_all_repetitions():
     assert len(rows.rare_failures(results)) == 3
 
 
-def test_dependencies_include_indirect_ones():
-    needs = {"a": ["b", "c"], "b": ["d"], "c": [], "d": ["b"], "e": ["c", "not there"]}
-    for wanted, expected in (("ae", "abcde"), ("e", "ce")):
-        assert dependencies.with_dependencies(needs, [*wanted]) == {*expected}
-
-
 def test_every_dependency_and_extra_has_a_purpose():
-    declared = dependencies.declared()
-    needed = [re.match(r"[\w-]+", requirement).group() for requirement in declared["dependencies"]]
-    assert set(needed) == set(dependencies.PURPOSE)
-    assert set(declared["optional-dependencies"]) == set(dependencies.EXTRAS)
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = {re.match(r"[\w-]+", text).group() for text in declared["dependencies"]}
+    page = (ROOT / "CONTRIBUTING.md").read_text().partition("## Dependencies")[2]
+    listed = re.findall(r"^\| ([\w-]+) \| [^-]", page.partition("###")[0], re.M)
+    extras = declared["optional-dependencies"].keys()
+    assert {*listed} - {"dependency", "extra"} == needed | extras
 
 
 def test_recipes_are_selected_by_device(recipe_folder, capsys):

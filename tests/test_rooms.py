@@ -128,7 +128,7 @@ def test_walls_of_an_image_are_within_the_tolerance(tmp_path):
             }
         )
         walls = MultiLineString(lines_of(task)[:-4]).segmentize(0.02)
-        assert walls.hausdorff_distance(blob.boundary.segmentize(0.02)) < tolerance + 0.05
+        assert walls.hausdorff_distance(blob.boundary.segmentize(0.02)) < tolerance + 0.1
         counts.append(len(task.walls) // 2)
     assert counts[0] > counts[1] > counts[2]
 
@@ -185,7 +185,7 @@ def test_a_goal_at_the_end_of_the_way_ahead_is_as_far_as_that(yaw):
         paths, _, _ = world(room(**HALL | {"start": start} | ends, polygons=[]), 20)
         lengths = [LineString([(0, 0), *path[1:]]).length for path in paths]
         assert min(lengths) == pytest.approx(0.5)
-        assert max(lengths) == pytest.approx(0.5 if ends["goal"] is goal else 5.5, abs=0.2)
+        assert max(lengths) == pytest.approx(0.5 if ends["goal"] is goal else 5.5, abs=0.25)
 
 
 def test_starts_goals_and_corners_may_coincide():

@@ -1,6 +1,5 @@
 """The site: tabs of all pages, links, equations, and reports of errors."""
 
-import ast
 import functools
 import http.server
 import os
@@ -14,7 +13,7 @@ from types import SimpleNamespace
 
 import chromium
 import pytest
-from helpers import ROOT, addresses, output_of
+from helpers import ROOT, addresses, docstrings, output_of
 
 import rps_jax
 
@@ -198,14 +197,7 @@ def test_an_example_that_is_not_code_is_an_error(tmp_path):
 
 def test_every_example_of_a_docstring_is_a_section_of_code():
     """As mkdocstrings parses it; other headings make quotes of its prompts."""
-    griffe = pytest.importorskip("griffe", reason="the extra docs is not installed")
-    docstrings = [
-        ast.get_docstring(node) or ""
-        for path in (ROOT / "rps_jax").rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-    ]
-    examples = [text for text in docstrings if ">>>" in text]
+    examples = [text for text in docstrings() if ">>>" in text]
     assert len(examples) > 30
     for text in examples:
         sections = griffe.Docstring(text).parse("google", warnings=False)

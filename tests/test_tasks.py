@@ -203,7 +203,7 @@ def test_the_end_of_a_path_that_is_passed_early_is_not_called_near():
     task = {"waypoints": points, "lookahead": 5}
     trace = rps_jax.push("cylinder", task=task, skin="ideal", setting=BRIEF)
     least, share = float(trace.outcome.min_distance), 100 * trace.outcome.task["progress"]
-    assert least < 0.1
+    assert least < 0.25
     assert share < 50
     assert f"least distance {least:.3f} m, " in trace.summary
     assert trace.summary.endswith(f", {share:.0f} % of the path passed")

@@ -2,16 +2,17 @@
 
 import re
 
+import graph_verifier
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from graph_verifier import GraphError
 from jax import lax
 
 from rps_jax.app.export import c, js
 from rps_jax.app.export import program as programs
 from rps_jax.control import registry
-from rps_jax.lowering import verifier
 from rps_jax.lowering.builder import SimdBuilder, results
 from rps_jax.lowering.graph import (
     Array,
@@ -23,7 +24,6 @@ from rps_jax.lowering.graph import (
     live_nodes,
     nodes_of,
 )
-from rps_jax.lowering.verifier import GraphError
 
 
 def function(x, i):
@@ -132,14 +132,14 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.__name__)
 def test_a_fault_is_found(fault):
     outputs = graph()
-    verifier.check(outputs)
+    graph_verifier.check(outputs)
     fault(outputs)
     with pytest.raises(GraphError, match=re.escape(FAULTS[fault])):
-        verifier.check(outputs)
+        graph_verifier.check(outputs)
 
 
 def test_a_graph_is_printed_one_line_for_each_node():
-    text = verifier.dump(graph())
+    text = graph_verifier.dump(graph())
     lines = text.splitlines()
     assert lines[0] == "v0: f[5] = Input 0()"
     assert re.search(r"^v\d+: f\[5\] = Call choose_f\(v\d+, v\d+, v\d+\)$", text, re.M)
@@ -150,9 +150,10 @@ def test_a_graph_is_printed_one_line_for_each_node():
 @pytest.mark.parametrize("law", registry.PACKAGE_LAWS)
 def test_the_graphs_of_a_law_are_valid(law, monkeypatch):
     """Each header and module has three routines, and a block for the network of a learned law."""
-    checked = []
-    check = verifier.check
-    monkeypatch.setattr(verifier, "check", lambda outputs: checked.append(check(outputs)))
+    checked, check = [], graph_verifier._check_region
+    monkeypatch.setattr(
+        graph_verifier, "check_nodes", lambda nodes: checked.append(check(nodes, set()))
+    )
     program = programs.program(law)
     c.header(program, "law")
     js.module(program, "law")

@@ -33,7 +33,7 @@ from rps_jax.lowering.builder import GraphBuilder
 from rps_jax.lowering.graph import Array, Gather, Node
 from rps_jax.lowering.js import JsWriter
 from rps_jax.lowering.routine import Group, Routine, fields_of, identifier, routine
-from rps_jax.lowering.scalar_builder import ScalarBuilder
+from rps_jax.lowering.scalar import ScalarBuilder
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE
 from rps_jax.runs.push import push

@@ -104,13 +104,13 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
         trials = results.sel(law=law)
         success = trials.success.values > 0
         mode_index = statistics.failure_modes(trials, max_lost)
-        failures = int((~success).sum())
+        most = statistics.fails_at_most(int((~success).sum()), success.size, laws)
         rows.append(
             [
                 law,
                 *(rate(success[mask]) for mask in groups.values()),
                 rate(success),
-                _at_most(statistics.fails_at_most(failures, success.size, laws)),
+                f"{100 * most:.{0 if most > 0.1 else 2 if most > 0.001 else 4}f} %",
                 _cvar(statistics.distance_left(trials)),
                 *(median(trials[name].values[success], text) for name, text in medians.values()),
                 *(str(int((mode_index == statistics.modes().index(mode)).sum())) for mode in modes),
@@ -123,11 +123,6 @@ def _cvar(distance: np.ndarray) -> str:
     low, high = statistics.cvar_interval(distance)
     interval = f"[{low:.2f}, {high:.2f}]" if high < np.inf else "(too few worlds for an interval)"
     return f"{statistics.cvar(distance):.2f} m {interval}"
-
-
-def _at_most(bound: float) -> str:
-    """Format an upper bound of a rate in percent, with more digits if it is small."""
-    return f"{100 * bound:.{0 if bound > 0.1 else 2 if bound > 0.001 else 4}f} %"
 
 
 def task_table(results: xr.Dataset) -> list[list[str]]:

@@ -19,7 +19,7 @@ from rps_jax.world.scene import Scene
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
-    from viser import ViserServer
+    from viser import SceneApi, ViserServer
 
 _PATH_STEP = 10  # moments between two points of a path
 _ROOT = "/push"
@@ -166,7 +166,7 @@ def _joined(points: Sequence[ArrayLike], height: float) -> np.ndarray:
     return lines if len(lines) else np.zeros((1, 2, 3))
 
 
-def _add_taxels(world: Any, name: str, shell: Shell) -> Any:
+def _add_taxels(world: SceneApi, name: str, shell: Shell) -> Any:
     """Add a tile for each taxel, along the rim of the base."""
     depth, height, z = _TAXEL
     quarters = np.asarray(shell.taxels(2))  # (T, 2, 2) [m] at 1/4 and 3/4 of each taxel
@@ -190,7 +190,7 @@ def _add_taxels(world: Any, name: str, shell: Shell) -> Any:
     )
 
 
-def _add_geoms(world: Any, model: mujoco.MjModel) -> None:
+def _add_geoms(world: SceneApi, model: mujoco.MjModel) -> None:
     """Add the visible geoms of a model in the frames of their bodies."""
     for i in range(model.ngeom):
         geom = model.geom(i)

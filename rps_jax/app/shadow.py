@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import PyTree
 
 from rps_jax import errors
 from rps_jax.analysis.report import Section
@@ -94,7 +95,7 @@ class Shadow(BagQuestion[xr.Dataset]):
         attrs = {"law": registry.resolve_law(self.law)[0], "doubts": doubts}
         return xr.Dataset(columns, coords, attrs)
 
-    def report(self, results: Any, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Return the differences between the twists of the law and the recorded ones."""
         rows = [["", "root mean square", "greatest", "at time [s]"]]
         is_nan = ~np.isfinite(results.to_array().sel(source="law")).all("variable").values
@@ -137,7 +138,7 @@ def pursued(recorded: Arrays, lookahead: float) -> np.ndarray:
         raise InputError("the bag has a path that changes: cut the bag where it does.")
     if np.ptp(path[0], axis=0).max() < _STILL:
         raise InputError("the bag has a path without length: publish two different poses or more.")
-    line: Any = jax.tree.map(jnp.asarray, Polyline.through(path[0]))
+    line: PyTree = jax.tree.map(jnp.asarray, Polyline.through(path[0]))
     course = PathCourse(line, jnp.asarray(lookahead))
     pose, contact = (jnp.asarray(recorded[name]) for name in ("pose", "p_robot_contact"))
     contacts = pose[:, :2] + planar.rotate(pose[:, 2], contact)
@@ -184,8 +185,8 @@ def shadowed(law: Law, params: LawParams, recorded: Arrays, robot: Robot = Robot
         return jnp.asarray(values[name], shape.dtype)
 
     @jax.jit
-    def run(params: LawParams, observations: Any) -> jax.Array:
-        def step(state: Any, row: Any) -> Any:
+    def run(params: LawParams, observations: PyTree) -> jax.Array:
+        def step(state: PyTree, row: PyTree) -> PyTree:
             sensed, last = row
             obs = with_base(sensed, robot.radius, robot)
             if law.observe_sent is not None:

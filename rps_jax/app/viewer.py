@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -55,6 +55,7 @@ _MODES = {
     "align": "turning towards the target",
     "away": "repositioning",
 }
+Event: TypeAlias = Any  # of viser, which is optional
 _CONTACTS = ("no contact", "point contact", "line contact")
 
 
@@ -323,10 +324,10 @@ class Page:
 
     # --- requests of the browser ---
 
-    def _connect(self, register: Callable[..., Any], act: Callable[[Any], None]) -> None:
+    def _connect(self, register: Callable[..., Any], act: Callable[[Event], None]) -> None:
         """Have `run` call `act` on each event of a browser, but not on its own events."""
 
-        def note(event: Any) -> None:
+        def note(event: Event) -> None:
             if event.client_id is not None:
                 self._requests.put(partial(act, event))
 
@@ -358,28 +359,28 @@ class Page:
         self._connect(shove.on_click, self._shove)
         self._connect(self._again.on_click, self._push_again)
 
-    def _toggle(self, _: Any) -> None:
+    def _toggle(self, _: Event) -> None:
         """Play or pause; restart a finished push."""
         self._playing = not self._playing
         if self._playing and self._push is not None and self._is_over(self._push.live):
             self._cursor = 0.0
 
-    def _seek(self, event: Any) -> None:
+    def _seek(self, event: Event) -> None:
         """Pause at another moment."""
         if self._push is not None:
             self._playing = False
             index = round(event.target.value / self._push.live.period)
             self._cursor = float(min(index, len(self._push.live.past) - 1))
 
-    def _push_again(self, _: Any) -> None:
+    def _push_again(self, _: Event) -> None:
         self.start(partial(self._build_push, self.request))
 
-    def _shove(self, _: Any) -> None:
+    def _shove(self, _: Event) -> None:
         distance, angle = self._distance.value, math.radians(self._direction.value)
         offset = distance * math.cos(angle), distance * math.sin(angle)
         self._disturb(lambda live: live.shove(offset))
 
-    def _drag(self, event: Any) -> None:
+    def _drag(self, event: Event) -> None:
         x, y, _ = event.target.position
         w, *_, z = event.target.wxyz
         if event.target is self._drawing.target:

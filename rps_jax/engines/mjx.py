@@ -39,15 +39,15 @@ from rps_jax.world.opengl import mujoco
 from rps_jax.world.scene import JOINTS, WorldInputs
 
 # Fields that differ between objects of one shape family, as paths into an MJX model.
-FIELDS = (
-    ".stat.meaninertia",
-    *(f".body_{name}" for name in ("pos", "ipos", "iquat", "mass", "subtreemass", "inertia")),
-    *(".body_invweight0", ".dof_invweight0", ".dof_M0", ".qpos0", ".qpos_spring"),
-    *(".geom_pos", ".geom_size", ".geom_aabb", ".geom_rbound", ".pair_friction"),
-)
+_FIELDS = """
+.stat.meaninertia .body_pos .body_ipos .body_iquat .body_mass .body_subtreemass .body_inertia
+.body_invweight0 .dof_invweight0 .dof_M0 .qpos0 .qpos_spring
+.geom_pos .geom_size .geom_aabb .geom_rbound .pair_friction
+"""
+FIELDS = _FIELDS.split()
 
 # The same of objects on pads.
-PADS = ".pair_solref", ".pair_solimp"
+PADS = [".pair_solref", ".pair_solimp"]
 # Field of prisms on explicit feet: (N, 2) [m]; other prisms stand on their outline.
 OUTLINE = "outline"
 BOUNDARY = "boundary"  # field of floors with two frictions: (4,) as of `Surroundings`

@@ -12,6 +12,7 @@ import numpy as np
 
 from rps_jax.engines import device
 from rps_jax.engines.base import Driven, Engine, Motion
+from rps_jax.geometry.vectors import turned, turned_back
 from rps_jax.record.files import Arrays
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
@@ -32,8 +33,7 @@ def _without_reset(model: mujoco.MjModel) -> mujoco.MjModel:
 
 def _in_base(wrench: np.ndarray, turn: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return wrenches (n, 3) of the world's axes in the base's frame, from (cos, sin) (n,)."""
-    (x, y, torque), (c, s) = wrench.T, turn
-    return np.stack([c * x + s * y, c * y - s * x, torque], axis=1)
+    return np.stack([*turned_back(turn, wrench.T), wrench.T[2]], axis=1)
 
 
 class Batch:
@@ -104,12 +104,11 @@ class Batch:
             self._push(rows, twist, substeps)
             return
         state, warmstart, nq = self.state[rows], self.warmstart[rows], self.qpos.shape[1]
-        v_x, v_y, omega = twist.T
+        omega = twist.T[2]
         yaw = state[:, 1 + JOINTS.base.start + 2] + omega * (substeps * self._timestep / 2)
-        c, s = np.cos(yaw), np.sin(yaw)
-        state[:, 1 + nq :][:, JOINTS.base] = np.stack(
-            [c * v_x - s * v_y, s * v_x + c * v_y, omega], axis=1
-        )
+        turn = np.cos(yaw), np.sin(yaw)
+        velocity = np.stack([*turned(turn, twist.T), omega], axis=1)
+        state[:, 1 + nq :][:, JOINTS.base] = velocity
         states = self._rollout(rows, state, warmstart, nstep=substeps)
         previous = states[:, -2] if substeps > 1 else state
         # By Euler's rule, the last change of velocity is the acceleration: the next first guess.
@@ -117,7 +116,7 @@ class Batch:
         # Only contact changes the velocity of the base, by a small amount: that gives its force.
         gained = states[:, -1, 1 + nq :][:, JOINTS.base] - state[:, 1 + nq :][:, JOINTS.base]
         wrench = self._inertia[rows] * gained / (substeps * self._timestep) - self._weight[rows]
-        self.force[rows] = _in_base(wrench, (c, s))
+        self.force[rows] = _in_base(wrench, turn)
         self.state[rows], self.warmstart[rows] = states[:, -1], change / self._timestep
 
     def _push(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:

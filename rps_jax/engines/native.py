@@ -38,10 +38,9 @@ from rps_jax.engines.base import Stage
 from rps_jax.engines.linear_map import linear_map, restrict, varied_indices
 from rps_jax.geometry import vectors
 from rps_jax.lowering import nvrtc
-from rps_jax.lowering.gpu_builder import WARP
-from rps_jax.lowering.gpu_writer import GpuWriter
-from rps_jax.lowering.simd_writer import HANDLER, SimdWriter
-from rps_jax.lowering.target import CompilerError, TooLargeError, UnsupportedError, first_array
+from rps_jax.lowering.gpu import WARP, GpuWriter
+from rps_jax.lowering.graph import CompilerError, TooLargeError, UnsupportedError, first_array
+from rps_jax.lowering.writer import HANDLER, SimdWriter
 from rps_jax.record import cache
 
 Pytree: TypeAlias = Any  # of arrays; functions of this module take any

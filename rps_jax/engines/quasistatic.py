@@ -124,9 +124,8 @@ def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tupl
     A pose is x, y [m], yaw [rad] in the world, for the object of its centre of mass.
     """
     base, pushed = poses
-    c, s = jnp.cos(base[2]), jnp.sin(base[2])
-    offset = (pushed[0] - base[0], pushed[1] - base[1])
-    p = (c * offset[0] + s * offset[1], c * offset[1] - s * offset[0])
+    turn = jnp.cos(base[2]), jnp.sin(base[2])
+    p = sp.turned_back(turn, (pushed[0] - base[0], pushed[1] - base[1]))
     v_x, v_y, omega = twist
     reach = sp.dot(slider.base_size, slider.base_size)
     problem = Problem(
@@ -137,11 +136,8 @@ def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tupl
         None if slider.pads is None else _turned(slider.pads, pushed[2] - base[2]),
     )
     v = solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
-
-    def turned(u: Vec) -> Vec:
-        return c * u[0] - s * u[1], s * u[0] + c * u[1], u[2]
-
-    return sp.add(base, sp.scale(dt, turned(twist))), sp.add(pushed, sp.scale(dt, turned(v)))
+    moves = [sp.scale(dt, (*sp.turned(turn, u), u[2])) for u in (twist, v)]
+    return sp.add(base, moves[0]), sp.add(pushed, moves[1])
 
 
 def solve(problem: Problem, v: Vec, dt: float) -> Vec:
@@ -196,8 +192,7 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
 
 def _turned(pads: tuple[Number, ...], yaw: Number) -> tuple[Number, ...]:
     """Return the rows of pads turned by an angle [rad]."""
-    (x, y, *rest), c, s = pads, jnp.cos(yaw), jnp.sin(yaw)
-    return c * x - s * y, s * x + c * y, *rest
+    return *sp.turned((jnp.cos(yaw), jnp.sin(yaw)), pads), *pads[2:]
 
 
 def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:

@@ -77,6 +77,18 @@ def norm(a: Sequence[Number], least: float = 1e-12) -> Number:
     return jnp.sqrt(jnp.maximum(dot(a, a), least * least))
 
 
+def turned(turn: tuple[Number, Number], a: Sequence[Number]) -> tuple[Number, Number]:
+    """Rotate x and y of a vector by an angle, given by its cosine and sine."""
+    (c, s), (x, y) = turn, a[:2]
+    return c * x - s * y, s * x + c * y
+
+
+def turned_back(turn: tuple[Number, Number], a: Sequence[Number]) -> tuple[Number, Number]:
+    """Rotate x and y of a vector by minus an angle, given by its cosine and sine."""
+    (c, s), (x, y) = turn, a[:2]
+    return c * x + s * y, c * y - s * x
+
+
 def to_world(m: Sequence[Vec], a: Vec) -> Vec:
     """Rotate a vector by the matrix with rows m."""
     return dot(m[0], a), dot(m[1], a), dot(m[2], a)

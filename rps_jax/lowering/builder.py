@@ -14,9 +14,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from rps_jax.lowering import verifier
 from rps_jax.lowering.graph import (
+    DTYPES,
+    REDUCTIONS,
     Array,
+    Body,
     Call,
     Carried,
     DynamicSlice,
@@ -27,23 +29,9 @@ from rps_jax.lowering.graph import (
     LoopResult,
     Node,
     Operation,
+    Params,
     Reduce,
     Result,
-    While,
-    element,
-    flat,
-    is_unchanged,
-    key_of,
-    live_nodes,
-    nodes_of,
-    view_of,
-)
-from rps_jax.lowering.operations import SIMD_HEADER, defined
-from rps_jax.lowering.target import (
-    DTYPES,
-    REDUCTIONS,
-    Body,
-    Params,
     Shape,
     Target,
     TooLargeError,
@@ -51,12 +39,21 @@ from rps_jax.lowering.target import (
     UnsupportedError,
     Value,
     Values,
+    While,
+    element,
+    flat,
     is_constant,
+    is_unchanged,
+    key_of,
     kind_of,
+    live_nodes,
+    nodes_of,
     operation_of,
     size_of,
+    view_of,
 )
-from rps_jax.lowering.walk import walk
+from rps_jax.lowering.operations import SIMD_HEADER, defined
+from rps_jax.lowering.walk import reduced_by_rows, sliding_windows, walk
 
 # Initial value of a reduction, by its operation and kind.
 INITIAL = {
@@ -157,7 +154,7 @@ class GraphBuilder(Target):
         shape, size = np.shape(value), size_of(np.shape(value))
         if len(axes) == len(shape) and size > 1 and (binary, kind) in INITIAL:
             return Array(self.node(Reduce(binary), [flat(value, size)], kind, size), 0, 0, ())
-        return self.reduced_by_rows(binary, value, axes, out)
+        return reduced_by_rows(self, binary, value, axes, out)
 
     def _product(self, lhs: Value, rhs: Value, dimensions: Any, out: Typed) -> Value:
         """Multiply matrices."""
@@ -197,7 +194,7 @@ class GraphBuilder(Target):
     def _slice(self, value: Value, starts: Values, sizes: Sequence[int], kind: str) -> Value:
         """Slice an array at an index that is known at run time, clamped to the array."""
         shape = np.shape(value)
-        index, windows = self.windows(shape, starts, sizes)
+        index, windows = sliding_windows(self, shape, starts, sizes)
         if is_constant(value):
             scalars = list(np.reshape(value, -1))
             value = Array(self.node(Gather(), scalars, kind, len(scalars)), 0, 1, shape)
@@ -289,8 +286,7 @@ def results(
         if size := size_of(template.shape):
             kind = target.kind(template.dtype, "a result")
             returned.append(Result(i, flat(value, size), size, kind))
-    verifier.check(returned)
-    return returned, nodes_of(result.value for result in returned)
+    return returned, nodes_of([result.value for result in returned])
 
 
 def _matrix_indices(value: Value, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from rps_jax.lowering.graph import kind_of
 from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.routine import Group, Routine
-from rps_jax.lowering.scalar_writer import ScalarWriter
-from rps_jax.lowering.target import kind_of
+from rps_jax.lowering.scalar import ScalarWriter
 from rps_jax.lowering.writer import literal as literal_of
 
 # `{p}` is the prefix of all names, `{P}` the same in capitals.

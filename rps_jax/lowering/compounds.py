@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import Primitive
 
-from rps_jax.lowering.target import UnsupportedError
+from rps_jax.lowering.graph import UnsupportedError
 
 Function: TypeAlias = Callable[..., Any]  # of arrays
 _BOUND = 2.0**31  # above all integers

@@ -13,7 +13,7 @@ import numpy as np
 from rps_jax.lowering.graph import Node
 from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.routine import Group, Routine
-from rps_jax.lowering.scalar_writer import ScalarWriter
+from rps_jax.lowering.scalar import ScalarWriter
 
 HELPERS = Path(__file__).with_name("helpers.js").read_text("utf-8")
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import jax
 
+from rps_jax.lowering.graph import CompilerError
 from rps_jax.lowering.operations import XLA_CALL
-from rps_jax.lowering.target import CompilerError
 
 # Quotients and square roots within two roundings, and zero for numbers below 1e-38.
 FLAGS = ("--prec-div=false", "--prec-sqrt=false", "--ftz=true")

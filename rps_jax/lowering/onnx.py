@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.lowering.operations import spelled
-from rps_jax.lowering.target import (
+from rps_jax.lowering.graph import (
     DTYPES,
     REDUCTIONS,
     Params,
@@ -24,6 +23,8 @@ from rps_jax.lowering.target import (
     operation_of,
     size_of,
 )
+from rps_jax.lowering.operations import spelled
+from rps_jax.lowering.walk import reduced_by_rows, sliding_windows
 
 _OPSET, _FORMAT = 18, 9  # versions of the operators and of the file
 _OPERATORS = spelled("onnx")
@@ -136,7 +137,7 @@ class Graph(Target):
 
     def _slice(self, x: Tensor, starts: Values, sizes: Sequence[int], out: Typed) -> Tensor:
         """Slice a tensor at an index that is known at run time, clamped to the tensor."""
-        index, table = self.windows(x.shape, starts, sizes)
+        index, table = sliding_windows(self, x.shape, starts, sizes)
         windows, size = self.constant(table.astype(np.int64)), size_of(sizes)
         indices = self.node("Gather", [windows, self.tensor(index)], (size,), "i", axis=0)
         flat = self.reshaped(x, (size_of(x.shape),))
@@ -155,7 +156,7 @@ class Graph(Target):
         over, shape = self.constant(np.array(axes, np.int64)), out.shape
         if binary == "xor" or (kind == "i" and binary not in ("max", "min")):
             # Its sums of integers do not wrap around.
-            return self.reduced_by_rows(binary, x, axes, out)
+            return reduced_by_rows(self, binary, x, axes, out)
         if kind == "b":
             whole = self._cast(x, "i")
             op = "ReduceMin" if binary == "and" else "ReduceMax"

@@ -11,7 +11,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from rps_jax import errors
-from rps_jax.lowering.target import Shape, kind_of, size_of
+from rps_jax.lowering.graph import Shape, kind_of, size_of
 from rps_jax.lowering.walk import traced
 from rps_jax.spec import spec_at
 

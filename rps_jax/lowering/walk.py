@@ -18,7 +18,7 @@ from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
 from rps_jax.lowering.compounds import COMPOUNDS, Function, fill_of
-from rps_jax.lowering.target import (
+from rps_jax.lowering.graph import (
     Body,
     Params,
     Shape,
@@ -320,3 +320,40 @@ def _count_equations(jaxpr: ClosedJaxpr | Jaxpr) -> int:
     params = jax.tree.leaves([list(eqn.params.values()) for eqn in jaxpr.eqns])
     inner = [x for x in params if isinstance(x, ClosedJaxpr | Jaxpr)]
     return len(jaxpr.eqns) + sum(map(_count_equations, inner))
+
+
+# --- operations of several targets, by others --------------------------------------------------
+
+
+def reduced_by_rows(
+    target: Target, binary: str, value: Value, axes: Sequence[int], out: Typed
+) -> Value:
+    """Reduce some axes by a binary operation for each row along them."""
+    shape = np.shape(value)
+    rest = [i for i in range(len(shape)) if i not in axes]
+    indices = np.transpose(np.arange(size_of(shape)).reshape(shape), [*axes, *rest])
+    first, *rows = indices.reshape(-1, *out.shape)
+    result = target.gather([value], first, out)
+    for row in rows:
+        result = target.apply(binary, [result, target.gather([value], row, out)], {}, out)
+    return result
+
+
+def sliding_windows(
+    target: Target, shape: Sequence[int], starts: Values, sizes: Sequence[int]
+) -> tuple[Value, np.ndarray]:
+    """Return the index of the window at a start, clamped, and the indices in each window."""
+    positions = np.arange(size_of(shape)).reshape(shape)
+    windows = np.lib.stride_tricks.sliding_window_view(positions, tuple(sizes))
+    zero = np.zeros((), np.int32)
+    index: Value = zero
+    for start, count in zip(starts, windows.shape, strict=False):
+        clamped: Value = zero
+        if count > 1:
+            clamped = target.apply("min", [start, np.asarray(count - 1, start.dtype)], {}, start)
+            if kind_of(start.dtype) == "u":
+                clamped = target.apply("convert_element_type", [clamped], {}, zero)
+            clamped = target.apply("max", [clamped, zero], {}, zero)
+        index = target.apply("mul", [index, np.asarray(count, np.int32)], {}, zero)
+        index = target.apply("add", [index, clamped], {}, zero)
+    return index, windows.reshape(-1, size_of(sizes))

@@ -1,31 +1,38 @@
-"""Printer of a graph as statements, the base of the printers of all languages but ONNX."""
+"""Printers of a graph as statements: the base of all languages but ONNX, and SIMD C."""
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
-from rps_jax.lowering.builder import INITIAL
+from rps_jax.lowering.builder import INITIAL, GraphBuilder, SimdBuilder, results
 from rps_jax.lowering.graph import (
     Array,
     Call,
+    DynamicSlice,
     For,
     Gather,
+    Input,
     LoopNode,
     LoopResult,
     Node,
     Reduce,
+    Result,
+    Typed,
+    Value,
     While,
+    first_array,
     is_unchanged,
+    kind_of,
     live_nodes,
     nodes_of,
 )
-from rps_jax.lowering.operations import TYPES
-from rps_jax.lowering.passes import schedule
-from rps_jax.lowering.target import Value, kind_of
+from rps_jax.lowering.operations import SIMD_HEADER, TYPES
 
 
 class Writer:
@@ -87,14 +94,62 @@ class Writer:
     ) -> list[str]:
         """Return the statements of nodes; `live_out` are read by later statements."""
         lines = list[str]()
-        for group in schedule(nodes, set(live_out), computed, self.is_fusible, self.choose_size):
-            if self.is_fusible(group.nodes[0]):
-                lines += self.fused(group.nodes, group.stored)
+        for group, stored, released in self.schedule(nodes, set(live_out), set(computed)):
+            if self.is_fusible(group[0]):
+                lines += self.fused(group, stored)
             else:
-                for node in group.nodes:
+                for node in group:
                     lines += self.loop(node) if isinstance(node, LoopNode) else self.single(node)
-            self.release(group.released)
+            self.release(released)
         return lines
+
+    def schedule(
+        self, nodes: Iterable[Node], live_out: Collection[Node], computed: set[Node]
+    ) -> Iterator[tuple[list[Node], set[Node], list[Node]]]:
+        """Yield groups of nodes in an order in which few loops over elements are needed.
+
+        A group is one loop over elements, a loop node, or single nodes. With it are those of its
+        nodes that later groups read, and the nodes that no later group reads.
+
+        Args:
+          nodes: to be computed.
+          live_out: nodes that are read after all groups.
+          computed: nodes that are computed before.
+        """
+        waiting, order = list(nodes), list[list[Node]]()
+        while waiting:
+            order.append(self._next_group(waiting, computed))
+            computed = computed.union(order[-1])
+            waiting = [node for node in waiting if node not in computed]
+        # Index of the last group that reads a node.
+        last = {x: i for i, group in enumerate(order) for n in group for x in (n, *n.predecessors)}
+        released: dict[int, list[Node]] = {}
+        for node in itertools.chain(*order):
+            if node not in live_out:
+                released.setdefault(last[node], []).append(node)
+        for i, group in enumerate(order):
+            stored = {node for node in group if node in live_out or last[node] > i}
+            yield group, stored, released.get(i, [])
+
+    def _next_group(self, waiting: Sequence[Node], computed: set[Node]) -> list[Node]:
+        """Return all single nodes that are ready, else one loop over elements, else a loop node."""
+        for kind in ("single", "fused", "loop"):
+            groups: dict[int, list[Node]] = {}
+            ready = set(computed)
+            for node in waiting:
+                node_kind = "fused" if self.is_fusible(node) else "single"
+                node_kind = "loop" if isinstance(node, LoopNode) else node_kind
+                if node_kind != kind or not ready.issuperset(node.predecessors):
+                    continue
+                if kind == "fused" and not node.fusion_barriers <= computed:
+                    continue
+                if kind == "loop":
+                    return [node]
+                groups.setdefault(node.size if kind == "fused" else 0, []).append(node)
+                ready.add(node)
+            if groups:
+                return groups[self.choose_size(groups)]
+        raise AssertionError("nodes wait for one another")
 
     def is_fusible(self, node: Node) -> bool:
         """Whether a node is printed in a loop over elements."""
@@ -246,3 +301,116 @@ def literal(value: float, kind: str, suffix: str = "f") -> str:
     if kind == "u":
         return f"{integer}u"
     return str(integer) if integer > -(2**31) else "-2147483647 - 1"
+
+
+HANDLER = "rps_native"  # placeholder of the name by which XLA calls the function
+STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of a number of a world
+# Placeholders in capitals are lines that are printed for a function.
+_FUNCTION = """\
+
+{TABLES}
+static void run_lanes(void **inputs, void **outputs, int64_t first, int64_t worlds) {{
+  int64_t at[LANES];
+  for (int l = 0; l < LANES; l++) {{
+    const int64_t index = first + l < worlds ? first + l : worlds - 1;
+    at[l] = {WORLD};
+  }}
+{LINES}
+}}
+
+XLA_FFI_Error *{NAME}(XLA_FFI_CallFrame *frame) {{
+  if (answers_version(frame)) return 0;
+  void *inputs[{INPUTS}], *outputs[{OUTPUTS}];
+  for (int i = 0; i < {INPUTS}; i++) inputs[i] = ((XLA_FFI_Buffer *)frame->args.args[i])->data;
+  for (int i = 0; i < {OUTPUTS}; i++) outputs[i] = ((XLA_FFI_Buffer *)frame->rets.rets[i])->data;
+  const int64_t worlds = count_worlds(frame->args.args[{SIZED}], {SIZE});
+  for (int64_t first = 0; first < worlds; first += LANES) run_lanes(inputs, outputs, first, worlds);
+  return 0;
+}}
+"""
+
+
+class SimdWriter(Writer):
+    """Printer of nodes as C with a vector lane for each world."""
+
+    table_type = "static const"
+    function, inputs = _FUNCTION, "inputs"
+    builder: type[GraphBuilder] = SimdBuilder
+
+    def constant(self, text: str, kind: str) -> str:
+        return f"all_{kind}({text})"
+
+    def table_declaration(self, name: str, array: np.ndarray) -> str:
+        kind = kind_of(array.dtype)
+        texts = self.array_literal(literal(x, kind) for x in array.reshape(-1))
+        stored = "int" if kind == "b" else STORED[kind]
+        return f"{self.table_type} {stored} {name}[{array.size}] = {texts};"
+
+    def single(self, node: Node) -> list[str]:
+        offset = f"* {node.size} + i]"
+        if isinstance(node.op, Input):
+            text = f"((const {STORED[node.kind]} *)inputs[{node.op.index}])[at[l] {offset}"
+            text = f"-(int){text}" if node.kind == "b" else text
+        elif isinstance(node.op, DynamicSlice):
+            index, source = node.operands
+            row, table = self.read(index, 1), self.table(np.array(node.op.windows))
+            text = f"{source.node.name}[{table}[{row}[l] {offset}][l]"
+        else:
+            return super().single(node)
+        line = f"  for (int l = 0; l < LANES; l++) {self.element(node)}[l] = {text};"
+        return [self.declare(node), *self.elements(node.size, [line])]
+
+    def end(self, result: Result) -> list[str]:
+        """Return the statements that store a result."""
+        position, a, size, kind = result
+        stored, truth = STORED[kind], " != 0" * (kind == "b")
+        lines = [
+            f"  {self.declaration(kind, 'e')} = {self.read(a, size)};",
+            "  for (int l = 0; l < LANES && first + l < worlds; l++)",
+            f"    (({stored} *)outputs[{position}])[at[l] * {size} + i] = e[l]{truth};",
+        ]
+        return self.elements(size, lines)
+
+    def source(
+        self,
+        closed: ClosedJaxpr,
+        shapes: Sequence[Typed],
+        outs: Sequence[Typed],
+        sorted_worlds: bool = False,
+    ) -> str:
+        """Return the function of a closed jaxpr that runs all worlds: `HANDLER`, or `step` of CUDA.
+
+        Args:
+          closed: the function of one world.
+          shapes: types of its arguments.
+          outs: types of its results.
+          sorted_worlds: whether one more argument has the order of the worlds.
+
+        Raises:
+          UnsupportedError: it has an operation that is not in the headers.
+          TooLargeError: a kernel needs too much shared memory.
+        """
+        returned, roots = results(closed, shapes, outs, self.builder())
+        nodes, (sized, size) = live_nodes(roots), first_array(shapes)
+        self.assign_storage(nodes, returned)
+        lines = self.lines(nodes, roots)
+        for result in returned:
+            lines += self.end(result)
+        order = f"((const int *){self.inputs}[{len(shapes)}])[index]"
+        return self.preamble() + self.function.format(
+            TABLES="\n".join(self.tables.values()),
+            LINES="\n".join(f"  {line}" for line in lines),
+            WORLD=order if sorted_worlds else "index",
+            INPUTS=len(shapes) + sorted_worlds,
+            OUTPUTS=len(outs),
+            NAME=HANDLER,
+            SIZED=sized,
+            SIZE=size,
+        )
+
+    def assign_storage(self, nodes: Iterable[Node], returned: Iterable[Result]) -> None:
+        """Choose where arrays are stored."""
+
+    def preamble(self) -> str:
+        """Return the text before the function, after its statements are printed."""
+        return SIMD_HEADER

@@ -40,7 +40,7 @@ from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy
@@ -52,6 +52,7 @@ from rps_jax.record.bag_storage import is_bag as is_bag
 from rps_jax.record.files import Arrays
 
 Message = dict[str, Any]  # fields of any type
+RosMessage: TypeAlias = Any  # of rosbags, with fields as attributes
 Floats = Sequence[float] | np.ndarray
 TopicsLike = str | Mapping[str, str] | Sequence[str]  # names of topics: see `topic_names`
 _MAX_NUMBERS = 2**27  # of all messages, and of all steps; a message counts 32 more
@@ -94,13 +95,13 @@ def check() -> None:
 # --- topics --------------------------------------------------------------------------------
 
 
-def _floats(*vectors: str) -> Callable[[Any], Floats]:
+def _floats(*vectors: str) -> Callable[[RosMessage], Floats]:
     """Return what reads numbers from a message, by names as `pose.position.xyz`."""
     parts = [vector.rpartition(".") for vector in vectors]
     return attrgetter(*(f"{owner}.{axis}" for owner, _, axes in parts for axis in axes))
 
 
-def _contact(message: Any) -> Floats:
+def _contact(message: RosMessage) -> Floats:
     """Return the middle of a contact, and its type."""
     points = [(p.x, p.y, p.z) for p in message.polygon.points]
     if len(points) > 2:
@@ -122,7 +123,7 @@ def _xy(values: np.ndarray) -> np.ndarray:
 _TREE, _RARE = ("tf", "tf_static"), ("target", "goal", "path")  # _RARE: topics that are no streams
 _POSITION = _floats("pose.position.xyz")
 _TF = {"tf2_msgs/TFMessage": _floats("transform.translation.xyz", "transform.rotation.xyzw")}
-_READERS: dict[str, dict[str, Callable[[Any], Floats]]] = {  # of messages, by topic and type
+_READERS: dict[str, dict[str, Callable[[RosMessage], Floats]]] = {  # of messages, by topic and type
     "odom": {"nav_msgs/Odometry": _floats("pose.pose.position.xyz", "pose.pose.orientation.xyzw")},
     "target": {
         "geometry_msgs/PointStamped": _floats("point.xyz"),

@@ -43,7 +43,6 @@ _KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a desc
 POINTER = b"version https://"  # first bytes of a pointer of Git LFS
 FETCH = "it is a pointer of Git LFS: fetch the file itself by `git lfs pull`"
 FIELD_FILES = (".json", ".yaml", ".yml")  # suffixes of files with names and values
-_PACKED = (".gz", ".bz2", ".xz", ".zip")
 _SAMPLE = 4096  # values of a column of results
 _COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 Arrays = dict[str, np.ndarray]  # by name
@@ -121,8 +120,8 @@ def suffix_of(path: str | Path) -> str:
 
 
 def unpacked(path: Path) -> Path:
-    """Return the path of a file that may be compressed, without a suffix as `.gz`."""
-    return path.with_suffix("") if suffix_of(path) in _PACKED else path
+    """Return the path of a file that may be compressed, without the suffix `.gz`."""
+    return path.with_suffix("") if suffix_of(path) == ".gz" else path
 
 
 def checksum_path(path: Path) -> Path:

@@ -14,6 +14,7 @@ from typing import Any, get_args
 
 from rps_jax.record import options
 from rps_jax.record.files import JsonObject
+from rps_jax.record.options import Hint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +39,7 @@ def stored_types(kind: type) -> dict[str, Stored]:
     return {name: stored for name, stored in pairs if stored is not None}
 
 
-def _annotation(hint: Any) -> Stored | None:
+def _annotation(hint: Hint) -> Stored | None:
     """Return the annotation of a type, of an alternative of it, or of its items."""
     metadata = getattr(hint, "__metadata__", ())
     inner = (_annotation(x) for x in get_args(hint) if not metadata)
@@ -47,7 +48,7 @@ def _annotation(hint: Any) -> Stored | None:
 
 def fields_to_json(record: Any, ignored: Collection[str] = ()) -> JsonObject:
     """Return the fields of a dataclass as JSON."""
-    entries: dict[str, Any] = {}
+    entries: JsonObject = {}
     for field in dataclasses.fields(record):
         if field.name in ignored:
             continue
@@ -60,9 +61,9 @@ def fields_to_json(record: Any, ignored: Collection[str] = ()) -> JsonObject:
     return entries
 
 
-def fields_from_json(kind: type, entries: JsonObject, folder: Path) -> dict[str, Any]:
+def fields_from_json(kind: type, entries: JsonObject, folder: Path) -> JsonObject:
     """Return the fields of a dataclass that `fields_to_json` wrote; a folder has more files."""
-    stored, values = stored_types(kind), dict[str, Any]()
+    stored, values = stored_types(kind), JsonObject()
     for field in dataclasses.fields(kind):
         if field.name in stored and (read := stored[field.name].read) is not None:
             values[field.name] = read(field.name, entries, folder)

@@ -11,17 +11,19 @@ import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, TypeAlias, get_args, get_origin
 
 import numpy as np
 
 from rps_jax import errors
 from rps_jax.record import files
+from rps_jax.record.files import JsonObject
 from rps_jax.spec import SPEC, Choices, Spec, specs_of
 
 HIDDEN, POSITIONAL, FLAG = "hidden", "positional", "flag"  # metadata of fields
+Hint: TypeAlias = Any  # an annotation: a type, or a form of `typing`
 _MAX_SHOWN = 200  # characters of a value in an error
-_NOUNS: dict[Any, str] = {  # of types, for errors
+_NOUNS: dict[Hint, str] = {  # of types, for errors
     str: "a text", Path: "a path", bool: "True or False", float: "a number", int: "a whole number",
     np.ndarray: "an array", Mapping: "a mapping of names", Callable: "a function",
 }  # fmt: skip
@@ -54,14 +56,14 @@ def option(
     return dataclasses.field(default=default, metadata=metadata, kw_only=kw_only)
 
 
-def field_types(kind: Any) -> dict[str, Any]:
+def field_types(kind: Hint) -> dict[str, Hint]:
     """Return the types of a dataclass's fields, or of a function's arguments, by name."""
     types_, choices = _types_of(kind)
     return types_ | {name: Literal[open_.names()] for name, open_ in choices.items()}
 
 
 @functools.cache
-def _types_of(kind: Any) -> tuple[dict[str, Any], dict[str, Choices]]:
+def _types_of(kind: Hint) -> tuple[dict[str, Hint], dict[str, Choices]]:
     """Return types by name, and the choices of those that a registry extends."""
     hints = typing.get_type_hints(kind, include_extras=True)
     choices = {
@@ -93,7 +95,7 @@ def check_arguments(function: Callable[..., object], values: Mapping[str, object
         _check(name, value, field_types(function)[name], None)
 
 
-def _check(name: str, value: Any, kind: Any, spec: Spec | None) -> None:
+def _check(name: str, value: Any, kind: Hint, spec: Spec | None) -> None:
     """Check a value by its type, and by the limits of its declaration."""
     kinds = _alternatives(kind)
     if value is None and type(None) in kinds:
@@ -125,12 +127,12 @@ def _check(name: str, value: Any, kind: Any, spec: Spec | None) -> None:
             errors.check_finite(name, number, **bounds)
 
 
-def _alternatives(kind: Any) -> Sequence[Any]:
+def _alternatives(kind: Hint) -> Sequence[Hint]:
     """Return the types of a union, or the type itself."""
     return get_args(kind) if get_origin(kind) in (typing.Union, types.UnionType) else (kind,)
 
 
-def _is_of(value: Any, kind: Any) -> bool:
+def _is_of(value: Any, kind: Hint) -> bool:
     """Return whether a value has a declared type; a tuple of numbers may be a list or an array."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (typing.Union, types.UnionType):
@@ -153,7 +155,7 @@ def _is_of(value: Any, kind: Any) -> bool:
         return _has_items(value) and not isinstance(value, str | bytes)
     if kind is Path:
         return isinstance(value, str | os.PathLike)
-    bare: Any = origin or kind
+    bare: Hint = origin or kind
     if bare is Any or not isinstance(bare, type) or hasattr(bare, "__get__"):
         return True
     return isinstance(value, bare)
@@ -163,7 +165,7 @@ def _has_items(value: Any) -> bool:
     return isinstance(value, Sequence) or (hasattr(value, "__iter__") and np.ndim(value) > 0)
 
 
-def _noun(kind: Any) -> str:
+def _noun(kind: Hint) -> str:
     """Return the noun of a type, for errors."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (tuple, Sequence):
@@ -199,14 +201,14 @@ def to_json(value: Any) -> Any:
 # --- texts with changes --------------------------------------------------------------------
 
 
-def parse_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
+def parse_changes(kind: str, text: str) -> tuple[str, JsonObject]:
     """Return the name and the changes of a text `NAME,FIELD=VALUE,FILE.json,...`.
 
     A value is a number, a text, or several of these between colons, as 3:10. A file holds fields
     with values. Errors name the `kind` of the text.
     """
     name, *assignments = text.split(",")
-    changes: dict[str, Any] = {}
+    changes: JsonObject = {}
     for assignment in assignments:
         field, equals, value = assignment.partition("=")
         if not equals and files.suffix_of(field) in files.FIELD_FILES:

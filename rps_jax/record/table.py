@@ -1,6 +1,6 @@
 """Tables of numbers that users write: CSV in the usual dialects, or Parquet, with units in titles.
 
-A file may be compressed, and in UTF-8, UTF-16 or Latin-1. Cells are separated by commas,
+A file may be compressed by gzip, and in UTF-8, UTF-16 or Latin-1. Cells are separated by commas,
 semicolons, tabs, bars or blanks; decimals have a point or a comma. Lines that start with # or % are
 comments; the last comment above the first row is the header if no other line is. Titles are
 compared without regard to case, blanks and units: `Time [ms]` is `time`, in milliseconds.
@@ -8,15 +8,12 @@ compared without regard to case, blanks and units: `Time [ms]` is `time`, in mil
 
 from __future__ import annotations
 
-import bz2
 import csv
 import gzip
 import importlib.util
 import io
-import lzma
 import re
 import textwrap
-import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -71,10 +68,11 @@ def read(path: Path, name: str) -> tuple[pd.DataFrame, str]:
     """
     check_parquet("log", path)
     content = files.read_regular(path, "table")
-    unpack = next((f for magic, f in _UNPACKERS.items() if content.startswith(magic)), bytes)
+    if content.startswith(b"PK"):
+        raise InputError(f"{name} is an archive: unpack it, or save its sheet as CSV.")
     try:
-        content = unpack(content)
-    except (OSError, EOFError, ValueError, lzma.LZMAError, zipfile.BadZipFile, zlib.error) as error:
+        content = gzip.decompress(content) if content.startswith(b"\x1f\x8b") else content
+    except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{name} cannot be unpacked ({error}): write CSV.") from error
     if content[:4] != b"PAR1":
         return _parse(_decode(content), name)
@@ -84,17 +82,6 @@ def read(path: Path, name: str) -> tuple[pd.DataFrame, str]:
         raise InputError(f"{name} is no Parquet table ({error}): write it again.") from error
     table = table.reset_index() if any(table.index.names) else table
     return table.set_axis(pd.RangeIndex(1, len(table) + 1)).rename(columns=str), "."
-
-
-def _unzip(content: bytes) -> bytes:
-    archive = zipfile.ZipFile(io.BytesIO(content))
-    if len(archive.namelist()) != 1:
-        raise ValueError("it holds several files; unpack it, or save its sheet as CSV")
-    return archive.read(archive.namelist()[0])
-
-
-_UNPACKERS = {b"\x1f\x8b": gzip.decompress, b"BZh": bz2.decompress}
-_UNPACKERS |= {b"\xfd7zXZ": lzma.decompress, b"PK": _unzip}
 
 
 def _decode(content: bytes) -> str:
@@ -107,7 +94,6 @@ def _decode(content: bytes) -> str:
 
 def _parse(text: str, name: str) -> tuple[pd.DataFrame, str]:
     """Return the cells of a text, and the sign of its decimals."""
-    text = text.replace("\N{MINUS SIGN}", "-").replace("\N{NO-BREAK SPACE}", " ")
     texts = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     lines = [(i, line) for i, line in enumerate(texts, 1) if line.strip(' \t,;|"')]
     rows = [(i, line) for i, line in lines if not _COMMENT.match(line)]
@@ -138,9 +124,7 @@ def _parse(text: str, name: str) -> tuple[pd.DataFrame, str]:
         table = tables[decimal].set_axis([i for i, _ in rows])
     except (ValueError, csv.Error) as error:
         raise InputError(f"{name} is no table ({error}): write CSV.") from error
-    count, ranges = len(titles), (np.arange(start, start + len(table)) for start in (0, 1))
-    if bool(table[count].notna().all()) and any(np.array_equal(table[0], x) for x in ranges):
-        table = table.iloc[:, 1:]  # the number of the row has no title
+    count = len(titles)
     more = table.iloc[:, count:].notna().sum(axis=1)
     if more.any():
         size, i = f"{count + more.max()} cells", more.idxmax()

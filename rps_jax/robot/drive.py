@@ -25,7 +25,7 @@ import jax.numpy as jnp
 
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number
-from rps_jax.geometry.vectors import Vec
+from rps_jax.geometry.vectors import Vec, turned, turned_back
 from rps_jax.robot.robot import Robot
 
 STALLED = 0.1  # [1] share of the executed speed below which a base stands still
@@ -143,12 +143,8 @@ def push(
       Force and torque [N, N, N m] of the drive on the base, in the world's frame; and the integral
       after the step.
     """
-    c, s = turn
-    errors = (
-        twist[0] - (c * velocity[0] + s * velocity[1]),
-        twist[1] - (c * velocity[1] - s * velocity[0]),
-        twist[2] - velocity[2],
-    )
+    v_x, v_y = turned_back(turn, velocity)
+    errors = twist[0] - v_x, twist[1] - v_y, twist[2] - velocity[2]
     inertia = (robot.mass, robot.mass, robot.inertia)
     if robot.drive != "omni":
         errors = _axle_errors(robot, twist, errors, xp)
@@ -167,8 +163,7 @@ def push(
         i + timestep * (m * rate**2 * e + rate * (u - d))  # anti-windup: u - d is the cut-off part
         for i, m, e, u, d in zip(integral, inertia, errors, output, demand, strict=True)
     )
-    force = (c * output[0] - s * output[1], s * output[0] + c * output[1], output[2])
-    return force, (x, y, z)
+    return (*turned(turn, output), output[2]), (x, y, z)
 
 
 def _axle_errors(robot: Robot, twist: Vec, errors: Vec, xp: ModuleType) -> Vec:

@@ -21,7 +21,6 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from rps_jax import errors
 from rps_jax.engines import device as devices
@@ -71,7 +70,7 @@ def _work(
 
 
 @contextlib.contextmanager
-def connected(address: str, **options: Any) -> Iterator[ModuleType]:
+def connected(address: str, **options: object) -> Iterator[ModuleType]:
     """Connect Ray to the cluster at an address, unless it is connected; yield the module.
 
     The address is host:port, `auto` (the cluster that this host is part of), or `local`: a cluster

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 import numpy as np
 import xarray as xr
@@ -80,7 +80,7 @@ def run_trials(
     shard: Shard = Shard(),
     *,
     execute: RunMissing = run_missing,
-    **options: Any,
+    **options: Unpack[BatchOptions],
 ) -> xr.Dataset:
     """Run a plan in memory, or what a run folder lacks of it or of a shard.
 
@@ -113,7 +113,7 @@ def run_trials(
         return results.dataset().isel(law=law, world=world)
 
 
-def run_plan(plan: Plan, folder: Path | None, **options: Any) -> xr.Dataset:
+def run_plan(plan: Plan, folder: Path | None, **options: Unpack[BatchOptions]) -> xr.Dataset:
     """Run what a run folder lacks of a plan; return the outcomes and write them there."""
     return write_dataset(run_trials(plan, folder, **options), folder)
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
@@ -228,14 +229,14 @@ def recorded_law(law: Law, senses: Senses = "taxels") -> Law:
     """
     is_touch = law.senses == "touch"
 
-    def step(params: LawParams, state: Any, obs: Any) -> tuple[Any, Twist, Any]:
+    def step(params: LawParams, state: PyTree, obs: PyTree) -> tuple[PyTree, Twist, PyTree]:
         state, twist, details = law.step(params, state, obs.touch if is_touch else obs)
         return state, twist, (details, obs)
 
     return dataclasses.replace(law, step=step, senses=senses if is_touch else law.senses)
 
 
-def bag_steps(trajectory: Trajectory, obs: Any, period: float) -> Iterator[Step]:
+def bag_steps(trajectory: Trajectory, obs: PyTree, period: float) -> Iterator[Step]:
     """Yield the steps of a bag of a recorded trial, with its observations (T, ...)."""
     snapshots, touch = trajectory.snapshots, obs.touch
     lines = {k: x for k, x in trajectory.world.task.lines().items() if k in Step._fields}

@@ -73,7 +73,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 D = TypeVar("D", bound="DataclassInstance")
 T = TypeVar("T", covariant=True)
-C = TypeVar("C", bound="Command[Any]")
+C = TypeVar("C", bound="Command[object]")
 Rows = list[list[str]]  # of a table in a report, with a header
 
 
@@ -101,7 +101,7 @@ def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
     return call
 
 
-def current_names(command: Any, values: Mapping[str, T]) -> dict[str, T]:
+def current_names(command: object, values: Mapping[str, T]) -> dict[str, T]:
     """Return values by the present names of fields of a command; warn of former names."""
     current = dict(values)
     for former, name in getattr(command, "RENAMED", {}).items():
@@ -128,7 +128,7 @@ class Command(Generic[T]):
     report_to: ProgressCallback | None = option(None, kw_only=True, hidden=True)
     """Callback that receives the progress instead of a bar."""
 
-    QUICK: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
+    QUICK: ClassVar[Mapping[str, object]] = {}  # values of `quick`, by the field's name
     MOVED: ClassVar[Mapping[str, str]] = {}  # what replaces a former flag, by the flag
     RENAMED: ClassVar[Mapping[str, str]] = {}  # present names of fields by their former ones
     # Fields of a class on which the answer does not depend, beside those of its base classes.
@@ -154,7 +154,7 @@ class Command(Generic[T]):
     def check(self) -> None:
         """Raise InputError for options that types and bounds allow but that make no sense."""
 
-    def quick_values(self) -> Mapping[str, Any]:
+    def quick_values(self) -> Mapping[str, object]:
         """Return the values of `quick`, by the field's name or OWNER.FIELD."""
         return self.QUICK
 
@@ -507,7 +507,7 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
 # --- small helpers of reports --------------------------------------------------------------
 
 
-def quick_note(question: Question[Any]) -> str:
+def quick_note(question: Question[object]) -> str:
     """Return the first line of the report of a quick run, or nothing if it has no quick values."""
     names = question.quick_values()
     values = (_value_in_words(name, attrgetter(name)(question)) for name in names)

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -53,6 +53,7 @@ _AXIS_SCALE = 4.0  # [1] step size along the archive's axes over that along othe
 _NEAR_MISSES = 0.1  # [1] share of the first worlds that the emitters' archives accept
 _MIN_FAILURES = 12  # failing cells of an object from which on only failures are accepted
 _DRAWN_AT_ONCE = 4096
+Archive: TypeAlias = Any  # of pyribs, which is optional
 _FIELDS = dict.fromkeys(("success", "time", "left"), ((), float))  # of an archive's elites
 
 
@@ -197,8 +198,8 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
 attack = call_of(Attack)
 
 
-def _grid_archive(dimensions: int, dims: Sequence[int], **options: Any) -> Any:
-    """Return a pyribs archive with axes from 0 to 1; pyribs is optional, hence `Any`."""
+def _grid_archive(dimensions: int, dims: Sequence[int], **options: object) -> Archive:
+    """Return a pyribs archive with axes from 0 to 1."""
     archives = errors.require("ribs.archives", "failures")
     ranges = [(0, 1)] * len(dims)
     return archives.GridArchive(solution_dim=dimensions, dims=dims, ranges=ranges, **options)
@@ -269,19 +270,19 @@ class _Search:
             history.append(sums)
         return self._labelled(archive, history).assign_attrs(attributes)
 
-    def _elites(self, archive: Any) -> Arrays:
+    def _elites(self, archive: Archive) -> Arrays:
         """Return the elites (n,) in the order of their cells, with the index of their object."""
         elites = archive.data()
         order = np.argsort(elites["index"])
         objects = elites["index"] // np.prod(self.cells)
         return {name: x[order] for name, x in (elites | {"which_object": objects}).items()}
 
-    def _count_failing(self, archive: Any) -> np.ndarray:
+    def _count_failing(self, archive: Archive) -> np.ndarray:
         """Return the number of the cells that hold a failure, by object (objects,)."""
         elites = self._elites(archive)
         return np.bincount(elites["which_object"], elites["success"] == 0, self.objects)
 
-    def _try(self, v: np.ndarray, archive: Any) -> np.ndarray:
+    def _try(self, v: np.ndarray, archive: Archive) -> np.ndarray:
         """Try worlds at varied quantities `v` (objects, n, varied), and add them to an archive.
 
         Returns:
@@ -316,7 +317,7 @@ class _Search:
             for name, values in trials.items():
                 values.values[rows[milder]] = trial[name].values[milder]
 
-    def _scheduler(self, k: int, archive: Any, threshold: float) -> Any:
+    def _scheduler(self, k: int, archive: Archive, threshold: float) -> Any:
         """Return pyribs' scheduler of new emitters for object `k`.
 
         Their archive starts with the elites whose severity reaches the threshold.
@@ -342,7 +343,7 @@ class _Search:
         ]
         return errors.require("ribs.schedulers", "failures").Scheduler(grid, sources)
 
-    def _labelled(self, archive: Any, history: Sequence[Mapping[str, float]]) -> xr.Dataset:
+    def _labelled(self, archive: Archive, history: Sequence[Mapping[str, float]]) -> xr.Dataset:
         """Return the archive and the history of the search with names and units."""
         axes, quantities = self.options.axes, {x.name: x for x in points.coordinates(self.domain)}
         elites = self._elites(archive)

@@ -37,11 +37,7 @@ _MARKS = "osvD^"  # of the senses in the figure
 def all_laws() -> tuple[str, ...]:
     """Return the names of all registered laws, ordered by their senses."""
     order, laws = get_args(Senses), registry.LAWS
-    return tuple(sorted(laws, key=lambda name: order.index(_senses(laws[name]))))
-
-
-def _senses(params: LawParams) -> Senses:
-    return law_of(params).senses
+    return tuple(sorted(laws, key=lambda name: order.index(law_of(laws[name]).senses)))
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,12 @@ up to the targets of the domain. Tasks with a path have no curriculum.
 import itertools
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from rps_jax import errors
 from rps_jax.control import soft
@@ -37,7 +38,7 @@ from rps_jax.world.scene import JOINTS
 from rps_jax.world.tasks.reach import Nothing
 
 T = TypeVar("T")
-ActCarry = tuple[State, TouchState, jax.Array]  # states, touch states, rewards (N,)
+ActCarry = tuple[State, TouchState, jax.Array]  # state, touch state, reward ()
 _RADIUS = 0.3  # [m] unit of the circumradius
 _TILT_SCALE = 6.0  # of half of the components of the object's axis
 _FAILURE_DECAY = 0.7  # of a world's failure rate, per trial in it
@@ -117,18 +118,13 @@ def ease(world: World, level: jax.Array) -> World:
     return world._replace(p_world_target=jnp.where(level < 1, target, world.p_world_target))
 
 
-def _unmapped(function: Callable[..., T], *_: Any) -> Callable[..., T]:
-    """Return the function itself, for one world, as `jax.vmap` returns it for several."""
-    return function
-
-
 def _together(
-    envs: Sequence[PushEnv], function: Callable[..., T], inputs: Sequence[tuple[Any, ...]]
+    envs: Sequence[PushEnv], function: Callable[..., T], inputs: Sequence[tuple[PyTree, ...]]
 ) -> list[T]:
     """Map `function(env, ...)` of one world over the inputs (N, ...) of each environment."""
     functions = [partial(function, env) for env in envs]
 
-    def in_xla(*inputs: tuple[Any, ...]) -> list[T]:
+    def in_xla(*inputs: tuple[PyTree, ...]) -> list[T]:
         return [jax.vmap(f)(*x) for f, x in zip(functions, inputs, strict=True)]
 
     run = native.concurrent(functions, in_xla) if all(env.is_native for env in envs) else in_xla
@@ -152,7 +148,7 @@ def _begin(
     return [_with_info(x, world=draw[0]) for x, draw in zip(batches, draws, strict=True)]
 
 
-def _with_info(batch: EnvBatch, **info: Any) -> EnvBatch:
+def _with_info(batch: EnvBatch, **info: PyTree) -> EnvBatch:
     """Return a batch whose states have other information."""
     return batch._replace(states=batch.states.replace(info=batch.states.info | info))
 
@@ -228,39 +224,6 @@ def _inputs(env: PushEnv, batch: EnvBatch) -> Pair:
     return inputs, privileged
 
 
-def act(
-    env: PushEnv,
-    network: Network,
-    batch: EnvBatch,
-    hidden: jax.Array,
-    action: jax.Array,
-    vmap: Callable[..., Any] = jax.vmap,
-    mapped: Callable[..., Any] | None = None,
-) -> tuple[EnvBatch, jax.Array]:
-    """Execute an action (N, A) in each world; return the batch and the rewards (N,).
-
-    `vmap` maps a function of one world over the batch; `_unmapped` is for one world. `mapped` does
-    so for the environment's steps, by default `vmap`; derivatives are fastest with `native.mapped`.
-    """
-    bounded, map_step = features.clip_action(action), mapped or vmap
-    pair = bounded[..., ::2]  # v_x and omega
-    inputs = batch.memory.touch_state, batch.states.info["observation"]
-    touch_state = vmap(TouchState.mark_decision)(*inputs)
-
-    def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
-        states, touch_state, reward = carry
-        states = map_step(env.step, (0, 0))(states, bounded if network.actions == 3 else pair)
-        touch_state = vmap(TouchState.update)(touch_state, states.info["observation"])
-        return (states, touch_state, reward + states.reward), None
-
-    carry = batch.states, touch_state, jnp.zeros_like(batch.earned)
-    steps = round(network.hold / env.dt)
-    (states, touch_state, reward), _ = jax.lax.scan(step, carry, length=steps)
-    memory = batch.memory._replace(touch_state=touch_state, hidden=hidden, action=bounded)
-    earned = batch.earned + reward
-    return EnvBatch(states, memory, jnp.zeros_like(batch.first), earned), reward
-
-
 def _act_together(
     envs: Sequence[PushEnv],
     network: Network,
@@ -268,19 +231,40 @@ def _act_together(
     hidden: jax.Array,
     action: jax.Array,
 ) -> list[tuple[EnvBatch, jax.Array]]:
-    """Execute the joined actions (sum of N, A) in the worlds of all environments: see `act`."""
+    """Execute the joined actions (sum of N, A) in the worlds of all environments.
 
-    def single(
+    Returns:
+      The batch of each environment and the rewards (N,).
+    """
+
+    def act(
         env: PushEnv, batch: EnvBatch, _: jax.Array, action: jax.Array
-    ) -> tuple[EnvBatch, jax.Array]:  # the kernel does not copy constant fields
-        moved, reward = act(env, network, batch, jnp.zeros(()), action, _unmapped)
+    ) -> tuple[EnvBatch, jax.Array]:
+        """Execute an action (A,) in one world; the kernel does not copy constant fields."""
+        bounded = features.clip_action(action)
+        command = bounded if network.actions == 3 else bounded[::2]  # v_x and omega
+        touch_state = batch.memory.touch_state.mark_decision(batch.states.info["observation"])
+
+        def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
+            state, touch_state, reward = carry
+            state = env.step(state, command)
+            touch_state = touch_state.update(state.info["observation"])
+            return (state, touch_state, reward + state.reward), None
+
+        carry = batch.states, touch_state, jnp.zeros_like(batch.earned)
+        steps = round(network.hold / env.dt)
+        (state, touch_state, reward), _ = jax.lax.scan(step, carry, length=steps)
+        memory = batch.memory._replace(
+            touch_state=touch_state, hidden=jnp.zeros(()), action=bounded
+        )
+        moved = EnvBatch(state, memory, jnp.zeros_like(batch.first), batch.earned + reward)
         return _with_info(moved, world=None), reward
 
     splits = np.cumsum([x.first.size for x in batches])[:-1]
     inputs = list(zip(batches, jnp.split(hidden, splits), jnp.split(action, splits), strict=True))
     results = []
     for (batch, reward), (old, new_hidden, _) in zip(
-        _together(envs, single, inputs), inputs, strict=True
+        _together(envs, act, inputs), inputs, strict=True
     ):
         memory = batch.memory._replace(hidden=new_hidden)
         batch = _with_info(batch._replace(memory=memory), world=old.states.info["world"])

@@ -19,20 +19,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import PyTree
 
 from rps_jax import errors
 from rps_jax.control import registry, validation
 from rps_jax.control.base import LawParams, Leaf, entries, named_leaves, unit_of_leaf
+from rps_jax.control.observation import Details, Twist
 from rps_jax.control.registry import LawsLike
 from rps_jax.engines import device, native
 from rps_jax.engines.base import Stage
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Array, Bools, Float, Floats, Number
 from rps_jax.record import cache, provenance
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import check_arguments
 from rps_jax.robot import base
 from rps_jax.robot.robot import RobotLike
+from rps_jax.robot.skin import Reading
 from rps_jax.trials import jobs, trial
 from rps_jax.trials.results import WORLD, labelled
 from rps_jax.trials.score import Objective
@@ -57,6 +61,7 @@ from rps_jax.world.tasks import TaskLike
 
 Score = Callable[..., Any]  # of a trajectory (T, ...) of one world, and other arguments
 ScoreLike = Score | Objective
+Scored = tuple[jax.Array, PyTree]  # scores, and auxiliary outputs
 _STEP = 1e-6  # of differences, relative to a quantity
 _SMALLEST = 0.01  # in its unit, below which the step is not relative
 _NOISE = 1e-12  # relative change of a number of a world that is rounding
@@ -165,7 +170,7 @@ def value_and_grad(
 
 def _gradients(
     inputs: Mapping[str, Any], change: float = 0.01, central: bool = False
-) -> tuple[Gradients, Any]:
+) -> tuple[Gradients, PyTree]:
     """Return the answer of `value_and_grad`, and the auxiliary outputs (law, world, ...).
 
     Secants are those of a relative `change` of a quantity, one-sided or `central`.
@@ -196,7 +201,7 @@ def _gradients(
     value, bend = np.empty((len(chosen), i.worlds)), np.empty((i.worlds, len(labels)))
     gradient = np.empty((*value.shape, len(labels)))
     secant, size = np.full_like(gradient, np.nan), np.ones_like(gradient)
-    tested, aux = list[np.ndarray](), [list[Any]() for _ in chosen]
+    tested, aux = list[np.ndarray](), [list[PyTree]() for _ in chosen]
     options = _Options(score, steps, replace(setting, seed=0), i.has_aux, i.states)
     used, temperature, order = np.zeros(len(labels), bool), 0.0, list[np.ndarray]()
     for at, drawn in points.draw_by_object(ranges, setting.world_seed, None, index):
@@ -355,9 +360,9 @@ def world_slopes(
       one-sided derivatives, which bound the relative errors of the central ones.
     """
 
-    def leaves(draw: Draw) -> dict[str, Any]:
+    def leaves(draw: Draw) -> Arrays:
         worlds = drawn_worlds(domain, draw, setting).worlds._replace(shift=None, key=None)
-        return named_leaves({"world": worlds})
+        return {k: np.asarray(x) for k, x in named_leaves({"world": worlds}).items()}
 
     def moved(coordinate: Coordinate, step: np.ndarray) -> Draw:
         if coordinate.name not in _VECTORS:
@@ -397,12 +402,12 @@ def world_slopes(
 class Trajectory(NamedTuple):
     """Snapshots of one trial of T control steps, with its world and parameters."""
 
-    time: Any  # (T,) [s]
-    qpos: Any  # (T, 10) as in `Trial`
-    reading: Any  # (T,) of the skin
-    twist: Any  # (T,) [m/s, m/s, rad/s] commanded, robot frame
-    details: Any  # (T,)
-    done: Any  # (T,) the trial had ended
+    time: Floats  # (T,) [s]
+    qpos: Float[Array, "*B 10"]  # (T, 10) as in `Trial`
+    reading: Reading  # (T,) of the skin
+    twist: Twist  # (T,) [m/s, m/s, rad/s] commanded, robot frame
+    details: Details  # (T,)
+    done: Bools  # (T,) the trial had ended
     world: World  # constants of the world
     params: LawParams  # parameters of the law
     state: Trial | None = None  # (T, ...) after each step, with `states`
@@ -443,23 +448,23 @@ class _Options(NamedTuple):
 @partial(jax.jit, static_argnames=("loop", "options"))
 def _value_and_slopes(
     stage: Stage,
-    inputs: Any,
+    inputs: PyTree,
     leaves: Mapping[str, Leaf],
     loop: ControlLoop,
     options: _Options,
-    args: tuple[Any, ...],
-) -> tuple[tuple[jax.Array, Any], dict[str, jax.Array]]:
+    args: tuple[PyTree, ...],
+) -> tuple[Scored, dict[str, jax.Array]]:
     """Return the scores (n,) of worlds and laws, and their derivatives (n, ...) by some leaves.
 
     Auxiliary outputs (n, ...) come with the scores.
     """
 
-    def single(shots: Any, world: World, params: LawParams) -> tuple[jax.Array, Any]:
+    def single(shots: PyTree, world: World, params: LawParams) -> Scored:
         snapshots, state = shots if options.states else (shots, None)
         columns = snapshots._asdict()
         return _score(options, Trajectory(**columns, world=world, params=params, state=state), args)
 
-    def scores(leaves: Mapping[str, Leaf]) -> tuple[jax.Array, Any]:
+    def scores(leaves: Mapping[str, Leaf]) -> Scored:
         moved = registry.replace_leaves(inputs, leaves)
         worlds, params = moved["world"], moved["params"]
         trials = trial.start_all(worlds, params, np.ones(len(worlds.qpos), bool), law=loop.law)
@@ -475,9 +480,7 @@ def _value_and_slopes(
         raise InputError(f"the derivative of score or law {validation.fault_of(error)}.") from error
 
 
-def _score(
-    options: _Options, trajectory: Trajectory, args: tuple[Any, ...] = ()
-) -> tuple[jax.Array, Any]:
+def _score(options: _Options, trajectory: Trajectory, args: tuple[PyTree, ...] = ()) -> Scored:
     """Return the score () of a trajectory (T, ...) and its auxiliary output.
 
     Raises:
@@ -517,7 +520,7 @@ def _sizes(coordinates: Sequence[Coordinate], drawn: Draw, leaves: Mapping[str, 
 
 def _moved_scores(
     run: Callable[..., Any],
-    inputs: Any,
+    inputs: PyTree,
     leaves: Mapping[str, Any],
     coordinates: Sequence[Coordinate],
     slopes: Sequence[Arrays],
@@ -564,9 +567,9 @@ def soft_score(
 
 def soft_times(
     snapshots: Snapshot | Trajectory,
-    d_success: Any,
-    touched: Any = False,
-    live: Any = 1.0,
+    d_success: Number,
+    touched: jax.Array | bool = False,
+    live: Number = 1.0,
     arrive: float = 0.005,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the weights (T,) of the steps before the arrival, and the steps () without contact.
@@ -604,10 +607,9 @@ def _notes(
             "pushes with any force: limit it by robot='kairos' or domain='real', with an engine "
             "other than quasistatic."
         )
-    useless: Any = (useful < 0.5).any(axis=0)
-    is_zero: Any = ~gradient.any(axis=(0, 1))
-    bent: Any = (bend > _MAX_BEND).any(axis=0)
-    is_empty: Any = ~np.isfinite(gradient).any(axis=1).all(axis=0)
+    useless, bent = np.any(useful < 0.5, axis=0), np.any(bend > _MAX_BEND, axis=0)
+    is_zero = ~np.any(gradient, axis=(0, 1))
+    is_empty = ~np.all(np.any(np.isfinite(gradient), axis=1), axis=0)
     for mask, sentence in (
         (~used & ~is_mass, f"No influence with the engine {engine}, which does not use them:"),
         (used & is_zero & ~is_mass, "Derivatives of zero in every world within the horizon:"),

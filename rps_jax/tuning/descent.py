@@ -26,6 +26,8 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
+from jaxtyping import PyTree
 
 from rps_jax import errors
 from rps_jax.control import registry
@@ -33,6 +35,7 @@ from rps_jax.control.base import LawParams
 from rps_jax.engines import native
 from rps_jax.engines.base import Stage
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Number
 from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
 from rps_jax.trials import trial
@@ -151,7 +154,7 @@ class TuneGrad(Descent):
         is_custom = name == "optimiser" and not isinstance(self.optimiser, str)
         return "custom" if is_custom else super()._field_as_json(name)
 
-    def _optimiser(self) -> Any:
+    def _optimiser(self) -> optax.GradientTransformation:
         return optimiser(self.optimiser, self.schedule, self.learning_rate, self.steps)
 
     def search(self) -> Search:
@@ -253,11 +256,13 @@ class TuneGrad(Descent):
         return gradients.estimate(gradients.clip(jnp.concatenate(samples), self.clip))
 
     @functools.cached_property
-    def _programs(self) -> dict[Callable[..., Any], Any]:
+    def _programs(self) -> dict[Callable[..., PyTree], Any]:
         """Functions that JAX compiles once for each shape family."""
         return {}
 
-    def _call(self, function: Callable[..., Any], times: dict[str, float], *inputs: Any) -> Any:
+    def _call(
+        self, function: Callable[..., PyTree], times: dict[str, float], *inputs: PyTree
+    ) -> PyTree:
         """Call a function of the options and some arrays; add the wall clock to `times` [s]."""
         program = self._programs.setdefault(function, jax.jit(partial(function, self)))
         count, start_time = program._cache_size(), time.perf_counter()
@@ -296,11 +301,11 @@ def _run_trials(
     period, rules = setting.physics.control_period, setting.rules
     params = jax.vmap(options.space.params)(gradients.per_world(vector, worlds))
 
-    def score(state: Trial, success: Any, missed: Any) -> Any:
+    def score(state: Trial, success: Number, missed: Number) -> Number:
         times = state.steps * period, state.lost_steps * period
         return objective.score(success, *times, missed, rules)
 
-    def proceed(state: Trial, _: None) -> tuple[Trial, Any]:
+    def proceed(state: Trial, _: None) -> tuple[Trial, PyTree]:
         inputs = jax.vmap(features, (0, 0, 0, None))(soft, params, state, loop)
         batch = stage, worlds, params, state
         (moved,) = trial.advance([batch], loop, round(options.window / period))

@@ -11,12 +11,13 @@ times.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
-Scores = Callable[[jax.Array, Any], jax.Array]
+Scores = Callable[[jax.Array, PyTree], jax.Array]
 
 
 class Estimate(NamedTuple):
@@ -66,7 +67,7 @@ def cosine(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def evolution(
-    scores: Scores, theta: jax.Array, worlds: Any, key: jax.Array, options: Options = Options()
+    scores: Scores, theta: jax.Array, worlds: PyTree, key: jax.Array, options: Options = Options()
 ) -> jax.Array:
     """Return slopes of the smoothed score along antithetic random steps, without derivatives.
 
@@ -81,8 +82,8 @@ def evolution(
 
 
 def random_steps(
-    theta: jax.Array, worlds: Any, key: jax.Array, options: Options
-) -> tuple[jax.Array, jax.Array, Any]:
+    theta: jax.Array, worlds: PyTree, key: jax.Array, options: Options
+) -> tuple[jax.Array, jax.Array, PyTree]:
     """Return normal directions (pairs, n, p), and thetas and worlds (2 pairs n, ...) along them.
 
     The first half of these are steps ahead, the second half the opposite ones.
@@ -105,12 +106,12 @@ def slopes_along(directions: jax.Array, values: jax.Array, options: Options) -> 
     return jnp.mean((values[0] - values[1]) * along, axis=0)
 
 
-def per_world(theta: jax.Array, worlds: Any) -> jax.Array:
+def per_world(theta: jax.Array, worlds: PyTree) -> jax.Array:
     """Return theta, (p,) or (n, p), for each world, (n, p)."""
     count = jax.tree.leaves(worlds)[0].shape[0]
     return jnp.broadcast_to(theta, (count, theta.shape[-1]))
 
 
-def repeat(worlds: Any, times: int) -> Any:
+def repeat(worlds: PyTree, times: int) -> PyTree:
     """Repeat worlds (n, ...) several times, (times n, ...)."""
     return jax.tree.map(lambda x: jnp.concatenate([x] * times), worlds)

@@ -5,12 +5,12 @@
 
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -133,10 +133,6 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     out: Path | str | None = field(default="runs/learn", kw_only=True)
     """Run folder, with `policy.npz`; a killed run resumes there."""
 
-    # Functions of the algorithm, which a subclass may replace.
-    start: ClassVar[Callable[..., RunnerState]] = staticmethod(collection.start)
-    update: ClassVar[Callable[..., tuple[RunnerState, Any]]] = staticmethod(collection.update)
-
     @functools.cached_property
     def domains(self) -> tuple[Domain, ...]:
         """Domains to learn in."""
@@ -247,8 +243,8 @@ class _Learner:
         self.network = network = collection.network_of(options, envs)
         compile_start = time.perf_counter()
         self._validation_tables = [env.table for env in validation_envs]
-        start = partial(options.start, options, network, envs, seed=options.setting.seed)
-        update = partial(options.update, options, network, envs)
+        start = partial(collection.start, options, network, envs, seed=options.setting.seed)
+        update = partial(collection.update, options, network, envs)
         evaluate = partial(collection.evaluate_policy, network, validation_envs)
         shapes = jax.eval_shape(start, tables)
         lowered = (

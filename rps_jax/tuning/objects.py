@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +28,7 @@ from rps_jax.analysis.report import Section
 from rps_jax.engines import finger
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar, solid
+from rps_jax.geometry.arrays import Pair
 from rps_jax.record.options import option
 from rps_jax.record.table import Table
 from rps_jax.runs.question import Question, Rows, Run, call_of
@@ -136,17 +136,17 @@ def _slider(x: jax.Array, outline: np.ndarray, pads: np.ndarray, radius: float) 
     return slider, jnp.stack([theta["camera_x"], theta["camera_y"]])
 
 
-@partial(jax.jit, static_argnames="steps")
+@jax.jit
 def _simulate(
-    x: jax.Array, fixed: tuple, path: jax.Array, start: jax.Array, end: jax.Array, steps: int
-) -> tuple[jax.Array, jax.Array]:
+    x: jax.Array, fixed: tuple, path: jax.Array, start: jax.Array, end: jax.Array
+) -> Pair:
     """Return final poses (n, 3) and gaps (n, 3) [m].
 
     These are at measured starts, if negative; at measured ends, if the finger still touches there;
     and at the ends of the model.
     """
     slider, camera = _slider(x, *fixed)
-    pushed = finger.push(slider, path + camera, start, steps)
+    pushed = finger.push(slider, path + camera, start)
     gap = jax.vmap(lambda pose, tip: finger.gap_of(slider, pose, tip + camera)[0])
     inside = jnp.minimum(gap(start, path[:, 0]), 0.0)
     touches = jax.lax.stop_gradient(pushed.gap[:, -1]) < _APART
@@ -154,12 +154,7 @@ def _simulate(
     return pushed.pose[:, -1], jnp.stack([inside, at_end, pushed.gap[:, -1]], axis=1)
 
 
-@partial(jax.jit, static_argnames="steps")
-def _derivatives(
-    x: jax.Array, fixed: tuple, path: jax.Array, start: jax.Array, end: jax.Array, steps: int
-) -> tuple[jax.Array, jax.Array]:
-    """Return the derivatives of `_simulate` by the parameters, along the last axis."""
-    return jax.jacfwd(_simulate)(x, fixed, path, start, end, steps)
+_derivatives = jax.jit(jax.jacfwd(_simulate))  # by the parameters, along the last axis
 
 
 @dataclass(frozen=True)
@@ -206,9 +201,8 @@ class ObjectFit:
         poses, slopes = [], []
         for first in range(0, len(pushes.path), _BATCH):
             part, count = _padded(pushes, first)
-            inputs = (x, fixed, *part, finger.STEPS)
-            poses.append(np.asarray(_simulate(*inputs)[0], float)[:count])
-            slopes.append(np.asarray(_derivatives(*inputs)[0], float)[:count])
+            poses.append(np.asarray(_simulate(x, fixed, *part)[0], float)[:count])
+            slopes.append(np.asarray(_derivatives(x, fixed, *part)[0], float)[:count])
         return np.concatenate(poses), np.concatenate(slopes)
 
     @property
@@ -262,15 +256,6 @@ def errors_of(pose: np.ndarray, end: np.ndarray) -> dict[str, np.ndarray]:
     return {"place": np.linalg.norm(pose[:, :2] - end[:, :2], axis=1), "turn": turn}
 
 
-def gaps_at_end(outline: ArrayLike, pushes: PushesLike, radius: float) -> np.ndarray:
-    """Return the gaps (n,) [m] at measured ends of pushes; NaN where the finger slid off."""
-    corners, data = finger.check_outline(outline), read_pushes(pushes)
-    x = jnp.zeros(len(PRIOR))
-    (batch, count), fixed = _padded(data, 0), _fixed(corners, radius)
-    gap = np.asarray(_simulate(x, fixed, *batch, finger.STEPS)[1])[:count]
-    return np.where(gap[:, 2] < _APART, gap[:, 1], np.nan)
-
-
 def fit(
     outline: ArrayLike,
     pushes: PushesLike,
@@ -291,10 +276,9 @@ def fit(
     if count > _BATCH:
         raise errors.not_allowed("pushes", count, f"give at most {_BATCH}")
     size = float(np.ptp(corners, axis=0).max()) / 2
-    end, steps = data.end, finger.STEPS
 
     def gaps_at(x: np.ndarray) -> np.ndarray:
-        return np.asarray(_simulate(jnp.asarray(x), fixed, *batch, steps)[1], float)[:count]
+        return np.asarray(_simulate(jnp.asarray(x), fixed, *batch)[1], float)[:count]
 
     first = gaps_at(mean)
     if (first[:, 0] < -_INSIDE).any():
@@ -304,17 +288,17 @@ def fit(
 
     def residuals(z: np.ndarray) -> np.ndarray:
         """Return robust residuals of poses and gaps, and those of the priors."""
-        pose, gaps = _simulate(jnp.asarray(mean + deviation * z), fixed, *batch, steps)
-        off, gap = np.asarray(pose, float)[:count] - end, np.asarray(gaps, float)[:count] / _GAP
+        pose, gaps = _simulate(jnp.asarray(mean + deviation * z), fixed, *batch)
+        off, gap = np.asarray(pose, float)[:count] - data.end, np.asarray(gaps, float)[:count]
         off[:, 2] = size * solid.wrap(off[:, 2])
-        rows = np.concatenate([(off / _UNIT).ravel(), gap[:, 0], gap[:, 1]])
+        rows = np.append(off / _UNIT, gap[:, :2].T / _GAP)
         return np.append(np.nan_to_num(np.sign(rows) * np.sqrt(np.log1p(rows**2))), z)
 
     def slopes(z: np.ndarray) -> np.ndarray:
         x, robust = mean + deviation * z, residuals(z)[: -len(z)]
-        pose, gap = (np.asarray(a, float)[:count] for a in _derivatives(x, fixed, *batch, steps))
+        pose, gap = (np.asarray(a, float)[:count] for a in _derivatives(x, fixed, *batch))
         pose = pose / _UNIT * np.array([1, 1, size])[:, None]
-        rows = np.concatenate([pose.reshape(-1, len(z)), gap[:, 0] / _GAP, gap[:, 1] / _GAP])
+        rows = np.concatenate([pose.reshape(-1, len(z)), *gap[:, :2].swapaxes(0, 1) / _GAP])
         # Derivative of Cauchy's root loss g = sqrt(log(1 + r^2)), with r^2 = exp(g^2) - 1.
         square = np.expm1(robust**2)
         ratio = np.where(square > 1e-12, np.sqrt(square) / np.maximum(abs(robust), 1e-9), 1.0)
@@ -348,7 +332,7 @@ def fit(
     }
     data_set = xr.Dataset(columns, {"parameter": list(PRIOR)})
     fitted = ObjectFit(data_set, corners, radius, _QUANTILE)
-    return fitted if np.isnan(end).any() else _calibrated(fitted, data)
+    return fitted if np.isnan(data.end).any() else _calibrated(fitted, data)
 
 
 def _calibrated(fitted: ObjectFit, data: Pushes) -> ObjectFit:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import PyTree
 
 from rps_jax import errors
 
@@ -35,7 +36,7 @@ def fixed_length(
     A derivative of a chaotic push has a useful direction and a useless norm.
     """
 
-    def normalise(updates: Any, params: Any = None) -> Any:
+    def normalise(updates: PyTree, params: PyTree = None) -> PyTree:
         return updates / jnp.maximum(jnp.sqrt(jnp.mean(updates**2)), 1e-30)
 
     mean, scale = optax.ema(momentum, debias=False), optax.scale_by_learning_rate(learning_rate)
@@ -44,7 +45,7 @@ def fixed_length(
 
 def optimisers() -> dict[str, Callable[..., optax.GradientTransformation]]:
     """Return `fixed_length` and the functions of optax whose first argument is a learning rate."""
-    result: dict[str, Callable[..., Any]] = {"fixed_length": fixed_length}
+    result: dict[str, Callable[..., optax.GradientTransformation]] = {"fixed_length": fixed_length}
     for name, function in inspect.getmembers(optax, inspect.isfunction):
         if [*inspect.signature(function).parameters][:1] == ["learning_rate"]:
             result[name] = function

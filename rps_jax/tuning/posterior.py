@@ -8,12 +8,13 @@ autoregressive in bins.)
 """
 
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jaxtyping import PyTree
 
 from rps_jax.geometry.arrays import Pair
 
@@ -28,7 +29,7 @@ _NOISE = 0.03  # of the statistics' spread, added in training
 _NEXT_WEIGHT = 0.6
 _PATIENCE = 8  # epochs without a better density before training stops
 
-Params = dict[str, Any]  # weights of a network: arrays, and tuples of arrays, by name
+Params = dict[str, PyTree]  # weights of a network: arrays, and tuples of arrays, by name
 Carry = tuple[Params, optax.OptState]  # of training: weights, and state of their optimiser
 
 

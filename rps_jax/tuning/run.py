@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import jax
 import numpy as np
@@ -160,7 +160,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
 
     # ---------------------------------------------------------------------------------------
 
-    def quick_values(self) -> Mapping[str, Any]:
+    def quick_values(self) -> Mapping[str, object]:
         """Values of `quick`; its choice of parameters is for RPS alone."""
         is_rps = isinstance(self.params, type(registry.LAWS["rps"]))
         return {k: v for k, v in self.QUICK.items() if k != "tuned" or is_rps}

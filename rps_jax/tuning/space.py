@@ -4,17 +4,18 @@ import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import Bound, LawParams, Leaf, entries
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
+from rps_jax.record.files import JsonObject
 
 SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}  # of RPS
 
@@ -96,7 +97,7 @@ class Space:
                 values[name] = _aligned(jnp.minimum, values[name], values[whole])
         return registry.replace_leaves(self.base, values)
 
-    def changed_values(self, vector: ArrayLike) -> dict[str, Any]:
+    def changed_values(self, vector: ArrayLike) -> JsonObject:
         """Return the tuned parameters of a vector (p,), and all others that differ from the preset.
 
         The preset is the first of the law; that of RPS has the paper's parameters. Parameters whose
@@ -120,12 +121,12 @@ def _share(bound: Bound, values: Mapping[str, Leaf], name: str) -> Leaf:
     return _aligned(operator.truediv, values[name], values[whole]) if whole else values[name]
 
 
-def _aligned(function: Callable[..., Any], value: Leaf, whole: Leaf) -> Any:
+def _aligned(function: Callable[..., PyTree], value: Leaf, whole: Leaf) -> PyTree:
     """Apply a function to entries (..., *shape) and numbers (...)."""
     return np.transpose(function(np.transpose(value), np.transpose(whole)))
 
 
-def _rounded(leaf: Leaf) -> Any:
+def _rounded(leaf: Leaf) -> PyTree:
     """Return a number, or nested lists of numbers, with seven digits."""
     rounded = [float(f"{float(x):.7g}") for x in np.ravel(leaf)]
     return np.reshape(rounded, np.shape(leaf)).tolist()

@@ -374,9 +374,14 @@ LABELS: dict[str, str] = {
 }
 # Random numbers of a world that belong to no range.
 UNRANGED = (
-    *("com_bearing", "key_0", "key_1", "sides", "turn"),
+    "com_bearing",
+    "key_0",
+    "key_1",
+    "sides",
+    "turn",
     *(f"corner_{i}" for i in range(SIDES)),
-    *("feet_number", "feet_turn"),
+    "feet_number",
+    "feet_turn",
 )
 streams.claim("a domain", *(x.name for x in fields(Domain)), *VELOCITY_ERRORS)
 streams.claim("an object", *UNRANGED, "object", "corners")

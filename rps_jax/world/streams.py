@@ -11,50 +11,27 @@ from hashlib import blake2b
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.geometry.solid import SIDES
 from rps_jax.record.files import Arrays
 
 _COUNT = 64  # columns of the frozen table
-_OBJECT = [
-    "mass",
-    "size",
-    "aspect",
-    "height",
-    "com_offset",
-    "com_bearing",
-    "friction_ground",
-    "friction_robot",
-]
-_TASK = ["lateral", "yaw", "gap", "distance", "bearing"]
-_BASE = [
-    "pose_noise",
-    "yaw_noise",
-    "pose_latency",
-    "command_delay",
-    "v_x_error",
-    "v_y_error",
-    "omega_error",
-]
-_COLUMNS = (
-    *_OBJECT,
-    *_TASK,
-    *("noise", "gain_spread", "dead_share"),
-    *_BASE,
-    *("key_0", "key_1", "sides", "turn"),
-    *(f"corner_{i}" for i in range(SIDES)),
-    *("robot_force", "robot_traction", "robot_lag", "robot_acceleration", "boundary"),
-    *("foam", "time_constant", "robot_slip", "feet", "feet_number", "feet_turn", "load_size"),
-    *("robot_slip_sideways", "robot_slip_yaw", "lookahead", "length", "turns"),
-    *(f"turn_angle_{i}" for i in range(7)),
-    *("width", "door_width", "slope", "slope_bearing", "boundary_factor"),
-)
+_TABLE = """
+mass size aspect height com_offset com_bearing friction_ground friction_robot
+lateral yaw gap distance bearing noise gain_spread dead_share
+pose_noise yaw_noise pose_latency command_delay v_x_error v_y_error omega_error
+key_0 key_1 sides turn
+corner_0 corner_1 corner_2 corner_3 corner_4 corner_5 corner_6 corner_7
+robot_force robot_traction robot_lag robot_acceleration boundary
+foam time_constant robot_slip feet feet_number feet_turn load_size
+robot_slip_sideways robot_slip_yaw lookahead length turns
+turn_angle_0 turn_angle_1 turn_angle_2 turn_angle_3 turn_angle_4 turn_angle_5 turn_angle_6
+width door_width slope slope_bearing boundary_factor
+"""
+_COLUMNS = _TABLE.split()
 # Tasks share columns: a world has one task.
 _SHARED = {"route": "turn_angle_6", "scale": "width"}
-_TABLE = {name: i for i, name in enumerate(_COLUMNS)}
+_INDICES = {x: _COLUMNS.index(_SHARED.get(x, x)) for x in (*_COLUMNS, *_SHARED)}
 # Columns of the frozen table by name, in their order.
-COLUMNS: dict[str, int] = dict(
-    sorted((_TABLE | {x: _TABLE[y] for x, y in _SHARED.items()}).items(), key=lambda item: item[1])
-)
+COLUMNS: dict[str, int] = dict(sorted(_INDICES.items(), key=lambda item: item[1]))
 _OWNERS: dict[str, str] = {}  # of all names that worlds use, in words
 
 

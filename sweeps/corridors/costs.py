@@ -23,7 +23,6 @@ from rps_jax.laws import resolve_law
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.progress import Progress
-from rps_jax.world.tasks import parse_task
 from rps_jax.worlds import parse_domain
 from sweeps.study_base import SpeedStudy, Table
 
@@ -99,7 +98,8 @@ costs = call_of(Costs)
 
 def domain_of(task: str) -> Domain:
     """Return boxes on a task of 20 m, which no trial ends in time."""
-    return parse_domain(DOMAIN if parse_task(task).HAS_TARGET else _BOXES, None, task)
+    has_target = parse_domain(_BOXES, None, task).task.HAS_TARGET
+    return parse_domain(DOMAIN if has_target else _BOXES, None, task)
 
 
 def kind_of_device() -> str:

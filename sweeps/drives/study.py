@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -17,9 +18,7 @@ import xarray as xr
 from rps_jax import Rules, Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.questions import Plan, Run, call_of, option
-from rps_jax.runs.question import TrialQuestion
-from rps_jax.runs.sweep import Sweep
-from sweeps.study_base import Rows, Study, Table, run_plans
+from sweeps.study_base import PlanStudy, Rows, Table, TrialStudy, plan_of, run_plans
 
 OMNI = "holonomic, rps_plus"
 
@@ -56,7 +55,7 @@ DOMAINS = ("wide", "real", "hostile")
 
 
 @dataclass(frozen=True)
-class Drives(TrialQuestion[xr.Dataset], Study[xr.Dataset]):
+class Drives(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
     """Compare bases with an omnidirectional one, in equal worlds of several domains.
 
     The results hold the outcomes (row, world); a row is a domain and a base.
@@ -74,26 +73,15 @@ class Drives(TrialQuestion[xr.Dataset], Study[xr.Dataset]):
     """Number of worlds of each domain."""
     setting: Setting = field(default=Setting("fused", seed=9029), kw_only=True)
 
-    @property
+    @cached_property
     def plans(self) -> dict[str, Plan]:
         """The sweep of each row."""
         plans = {}
         for domain, name in product(self.domains, self.bases):
             robot, law, rules = BASES[name]
             setting = replace(self.setting, rules=rules or self.setting.rules)
-            sweep = Sweep(law, domain, self.worlds, robot=robot, setting=setting)
-            plans[f"{domain} | {name}"] = sweep.plan
+            plans[f"{domain} | {name}"] = plan_of(law, domain, self.worlds, setting, robot)
         return plans
-
-    def check(self) -> None:
-        """Check that the engine can step these worlds here."""
-        super().check()
-        for plan in self.plans.values():
-            plan.check_here()
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return len(self.domains) * len(self.bases) * self.worlds
 
     def answer(self, run: Run) -> xr.Dataset:
         """Sweep each row."""

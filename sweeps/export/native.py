@@ -28,8 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import Law, Observation, Robot, Twist
-from rps_jax.app.export import c, folder, onnx_model, program
-from rps_jax.app.export.program import Program
+from rps_jax.app.export import folder, onnx_model, program
 from rps_jax.control import validation
 from rps_jax.laws import law_of, resolve_law
 
@@ -72,7 +71,7 @@ def compiled(compiler: str, source: Path, precision: Precision, *flags: str) -> 
 class Structs:
     """Arrays of the input and output structs of a law."""
 
-    def __init__(self, exported: Program, form: Form):
+    def __init__(self, exported: Any, form: Form):
         """Create the types of a program's groups."""
         self.program, self.real = exported, REAL[form]
         self.dtypes = {name: self._dtype(group) for name, group in exported.groups.items()}
@@ -100,11 +99,11 @@ class Structs:
 class Native(Structs):
     """A law in C, compiled and loaded."""
 
-    def __init__(self, exported: Program, path: Path, precision: Precision, compiler: str = "gcc"):
+    def __init__(self, exported: Any, path: Path, precision: Precision, compiler: str = "gcc"):
         """Compile the law in a folder."""
         super().__init__(exported, precision)
         folder = Path(tempfile.mkdtemp(dir=path))  # a library is loaded once from one path
-        (folder / "law.h").write_text(c.header(exported, "law"))
+        (folder / "law.h").write_text(header(exported))
         driver = folder / "driver.c"
         driver.write_text(DRIVER)
         library = compiled(compiler, driver, precision, "-O2", *STRICT, "-fPIC", "-shared")
@@ -142,7 +141,7 @@ class Native(Structs):
 class Onnx(Structs):
     """A law as an ONNX model for a number of worlds, in a session of the runtime."""
 
-    def __init__(self, exported: Program, count: int):
+    def __init__(self, exported: Any, count: int):
         """Write the model and load it."""
         import onnx
         import onnxruntime
@@ -177,12 +176,17 @@ class Onnx(Structs):
         return twist, np.zeros(len(obs), np.int32)
 
 
-def build_law(form: Form, exported: Program, path: Path, count: int) -> Native | Onnx:
+def header(exported: Any) -> str:
+    """Return the header of a law in C."""
+    return folder.files(exported, "law")["law.h"]
+
+
+def build_law(form: Form, exported: Any, path: Path, count: int) -> Native | Onnx:
     """Return a law in C, or in ONNX for `count` worlds."""
     return Onnx(exported, count) if form == "onnx" else Native(exported, path, form)
 
 
-def observations(exported: Program, rng: np.random.Generator, count: int, real: Any) -> Any:
+def observations(exported: Any, rng: np.random.Generator, count: int, real: Any) -> Any:
     """Return random observations (count, ...) of a law."""
 
     def draw(name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -499,12 +503,10 @@ class Fuzzed(NamedTuple):
     said: str  # output of the sanitizers
 
 
-def fuzzed(
-    exported: Program, compiler: str, precision: Precision, inputs: int, path: Path
-) -> Fuzzed:
+def fuzzed(exported: Any, compiler: str, precision: Precision, inputs: int, path: Path) -> Fuzzed:
     """Step a law with odd inputs, with address and undefined-behaviour sanitizers."""
     build = Path(tempfile.mkdtemp(dir=path))
-    (build / "law.h").write_text(c.header(exported, "law"))
+    (build / "law.h").write_text(header(exported))
     (build / "fuzz.c").write_text(FUZZ)
     options = (*STRICT, *SANE, f"-DINPUTS={inputs}")
     binary = compiled(compiler, build / "fuzz.c", precision, *options)

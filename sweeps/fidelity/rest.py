@@ -20,7 +20,7 @@ from rps_jax.physics import PHYSICS, Physics, get_engine, preset
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
 from rps_jax.trials.worlds import starts
-from rps_jax.world import draws
+from rps_jax.world import points
 from rps_jax.worlds import parse_domain
 from sweeps.study_base import QuickStudy, Rows, Table
 
@@ -74,7 +74,7 @@ class Rest(QuickStudy[xr.Dataset]):
         moved, family = np.zeros(self.worlds), np.empty(self.worlds, object)
         for i in range(len(ranges.objects)):
             rows = index[ranges.object_of(index) == i]
-            drawn = draws.draw(ranges, self.seed, rows)
+            drawn = points.draw(ranges, self.seed, None, rows)
             family[rows] = ranges.families[i]
             stage, _ = c.stage(drawn.inputs(ranges, physics))
             qpos = starts(drawn)

@@ -25,13 +25,10 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.special import softmax
 
 from rps_jax import Domain, Setting, Twist
-from rps_jax.engines.base import Stage
 from rps_jax.geometry import planar
 from rps_jax.geometry.solid import rotate
 from rps_jax.physics import ControlPeriod, Motion, Physics, get_engine
-from rps_jax.robot.robot import LIMITS
 from rps_jax.trials.trial import object_pose
-from rps_jax.tuning.logs import Log
 from rps_jax.world import points
 from rps_jax.world.domain import quantities_of
 from rps_jax.world.points import Points
@@ -48,6 +45,18 @@ _INFORMATION = 0.07
 _PRIOR = 3.0  # precision of a nearly flat density around the middle of the cube
 _PROPOSALS = 100_000  # of the sampler, for each minimum
 _MAX_COORDINATE = 1 - 1e-6  # greatest coordinate
+_LIMITS = (  # of a robot, without which the base follows its measured path
+    "v_max",
+    "omega_max",
+    "lag",
+    "acceleration_max",
+    "force_max",
+    "torque_max",
+    "traction",
+    "slip",
+    "slip_sideways",
+    "slip_yaw",
+)
 
 
 def _rows(interval: float) -> tuple[int, int]:
@@ -76,7 +85,7 @@ class Track(NamedTuple):
     interval: float  # [s]
 
     @classmethod
-    def of(cls, log: Log, interval: float, exact: bool, force: bool) -> Track:
+    def of(cls, log: Any, interval: float, exact: bool, force: bool) -> Track:
         """Return the paths of a log (1, T, ...), smooth ones unless its poses are exact."""
         rows, settling = _rows(interval)
         count = int(log.valid[0].sum())
@@ -188,7 +197,7 @@ class Replay(NamedTuple):
             steps[1 + 2 * i : 3 + 2 * i, 0, column] = _STEP, -_STEP
         moved = (u + steps).reshape(-1, u.shape[1])
         drawn = points.draw(self.domain, 0, Points(moved), np.arange(len(moved)))
-        robots = dataclasses.replace(drawn.robot, **dict.fromkeys(LIMITS))
+        robots = dataclasses.replace(drawn.robot, **dict.fromkeys(_LIMITS))
         inputs = drawn.inputs(self.domain, self.setting.physics)._replace(robots=robots)
         stage, fields = get_engine(self.setting.engine).stage(inputs)
         latency = np.zeros(len(moved)) if self.exact else drawn.values["pose_latency"]
@@ -208,14 +217,14 @@ class Replay(NamedTuple):
 
 @partial(jax.jit, static_argnames="physics")
 def _linearised(
-    stage: Stage, inputs: Any, slopes: Any, physics: Physics
+    stage: Any, inputs: Any, slopes: Any, physics: Physics
 ) -> tuple[jax.Array, jax.Array]:
     """Return residuals (n, C), and their derivatives (p, n, C) along slopes (p, n, ...)."""
     replay = partial(_replay, stage, physics=physics)
     return replay(inputs), jax.vmap(lambda x: jax.jvp(replay, (inputs,), (x,))[1])(slopes)
 
 
-def _replay(stage: Stage, inputs: Any, physics: Physics) -> jax.Array:
+def _replay(stage: Any, inputs: Any, physics: Physics) -> jax.Array:
     """Return the residuals (n, C) of windows, of worlds with these fields and heights."""
     fields, height, windows = inputs
     zero, force = jnp.zeros_like(height), windows.result.shape[-1] > 6

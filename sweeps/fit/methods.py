@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cmaes
 import jax
@@ -28,9 +28,7 @@ from rps_jax.analysis.figures.style import quantity
 from rps_jax.engines import device
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import no_progress, set_phase
-from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import fit, posterior
-from rps_jax.tuning.logs import Log
 from rps_jax.world import points
 from rps_jax.worlds import DomainLike
 from sweeps.fit import least_squares
@@ -62,6 +60,7 @@ class Methods(FitStudy):
 
     TITLE = "Methods of fitting worlds to logs"
     GROWS = ("evolution_logs",)
+    ROW: ClassVar = 2
     QUICK: ClassVar = {"worlds": 192, "logs": 2, "window": 12.0}
 
     domain: DomainLike = "wide,objects=random_box"
@@ -74,12 +73,6 @@ class Methods(FitStudy):
     """Number of logs, those with the fewest windows, that CMA-ES fits; in whole parts of 25."""
     starts: int = option(48, 6, 1000, kw_only=True)
     """Number of worlds from which least squares and CMA-ES start."""
-
-    @cached_property
-    def bank(self) -> fit.Bank:
-        """Simulated worlds, with a row of the log in every second control step."""
-        period = self.setting.physics.control_period
-        return fit.Bank(self.ranges, self.params, self.setting, self.window, 2 * period)
 
     def answer(self, run: Run) -> xr.Dataset:
         """Fit the logs by each method and from each kind of log.
@@ -137,9 +130,9 @@ class Methods(FitStudy):
         )
 
     @cached_property
-    def test_logs(self) -> list[Log]:
+    def test_logs(self) -> list[Any]:
         """Logs of the test worlds."""
-        logs = dict[int, Log]()
+        logs = dict[int, Any]()
         index = np.arange(self.logs)
         for at, drawn in points.draw_by_object(self.ranges, self.test_seed, None, index):
             batch = self.bank.logs(drawn)
@@ -182,11 +175,6 @@ class Methods(FitStudy):
         truth = points.points_of(self.ranges, index, self.test_seed)[:, columns]
         fits = self.compare_samples(results, truth, index).assign_coords(log=index)
         return fits.assign(seconds=("log", np.full(len(index), seconds)), windows=("log", counts))
-
-    @property
-    def test_seed(self) -> int:
-        """Seed of the test worlds."""
-        return seed_of(self.setting.seed, "test")
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the comparison of the methods, over all quantities and by quantity."""

@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import Setting
-from rps_jax.control import registry
+from rps_jax.laws import resolve_law
 from rps_jax.questions import Run, call_of, option
 from rps_jax.runs.question import SimulationQuestion
 from rps_jax.trials.setting import seed_of
@@ -72,7 +72,7 @@ class OnePush(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     @cached_property
     def _bank(self) -> Bank:
         domain = parse_domain("wide,objects=random_box,pose_latency=0:0")
-        _, law = registry.parse_law("rps")
+        _, law = resolve_law("rps")
         period = self.setting.physics.control_period
         return Bank(domain, law, self.setting, self.length, 2 * period)
 

@@ -11,9 +11,9 @@ the fitted domain, and compares both with trials in the true worlds.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
@@ -25,7 +25,6 @@ from rps_jax.laws import law_of
 from rps_jax.questions import LawQuestion, Picture, Run, call_of, option
 from rps_jax.runs.question import DomainQuestion
 from rps_jax.trials.progress import Progress, no_progress, set_phase
-from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import fit, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
@@ -48,6 +47,8 @@ _TASK = (*domains.quantities_of("task"), "key_0", "key_1")
 class FitStudy(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     """Base class of studies that fit logs of test worlds, whose true values are known."""
 
+    ROW: ClassVar = 1  # control steps of a row of a log
+
     worlds: int = option(8064, 192, 1_000_000, kw_only=True)
     """Number of worlds for training."""
     logs: int = option(240, 24, 10_000, kw_only=True)
@@ -58,23 +59,26 @@ class FitStudy(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
 
     @cached_property
     def bank(self) -> fit.Bank:
-        """Simulated worlds, with a row of the log in each control step."""
-        period = self.setting.physics.control_period
-        return fit.Bank(self.ranges, self.params, self.setting, self.window, period)
+        """Simulated worlds."""
+        interval = self.ROW * self.setting.physics.control_period
+        return fit.Bank(self.ranges, self.params, self.setting, self.window, interval)
+
+    @property
+    def test_seed(self) -> int:
+        """Seed of the test worlds."""
+        return replace(self.setting, split="test").world_seed
 
     def check(self) -> None:
         """Check the law and the engine."""
         self.check_engine([self.params])
         fit.check_law(self.label, law_of(self.params), self.setting)
 
-    def train(self, training: xr.Dataset, names: Sequence[str]) -> posterior.Posterior:
+    def train(self, training: xr.Dataset, names: Sequence[str]) -> Any:
         """Return networks for some statistics of the logs."""
         bank = training.sel(statistic=names)
         return posterior.train(bank.u.values, bank.statistics.values, self.setting.seed)
 
-    def compare(
-        self, networks: posterior.Posterior, statistics: np.ndarray, test: xr.Dataset
-    ) -> xr.Dataset:
+    def compare(self, networks: Any, statistics: np.ndarray, test: xr.Dataset) -> xr.Dataset:
         """Return the fits to statistics (log, N, F) of the test worlds, with the true values."""
         samples = (
             posterior.sample(networks, x, fit.SAMPLES, log) for log, x in enumerate(statistics)
@@ -129,7 +133,7 @@ class Coverage(FitStudy):
     """Number of pushes in each of these worlds."""
 
     @cached_property
-    def _networks(self) -> dict[tuple[str, ...], posterior.Posterior]:
+    def _networks(self) -> dict[tuple[str, ...], Any]:
         """Trained networks, by the names of their statistics."""
         return {}
 
@@ -149,9 +153,7 @@ class Coverage(FitStudy):
         worth = run.checkpoint("worth", partial(self._predict, training, test, run))
         return xr.merge([coverage, worth])
 
-    def _train(
-        self, kind: str, training: xr.Dataset, run: Run
-    ) -> tuple[posterior.Posterior, list[str]]:
+    def _train(self, kind: str, training: xr.Dataset, run: Run) -> tuple[Any, list[str]]:
         """Return networks for a kind of log, and the names of their statistics."""
         names = fit.statistic_names(training, KINDS.get(kind, ()))
         if tuple(names) not in self._networks:
@@ -172,7 +174,7 @@ class Coverage(FitStudy):
         """Return statistics (log, 3, F) of three more pushes in each test world."""
 
         def compute() -> xr.Dataset:
-            index, seed = np.arange(self.logs), seed_of(self.setting.seed, "test")
+            index, seed = np.arange(self.logs), self.test_seed
             objects, values = self.ranges.object_of(index), np.empty((self.logs, 3, len(names)))
             for push in range(3):
                 for i in np.unique(objects):
@@ -193,7 +195,7 @@ class Coverage(FitStudy):
         x = test.sel(statistic=names).statistics.values[:, :1]
         columns = points.names(self.ranges)
         task = [columns.index(name) for name in _TASK if name in columns]
-        index, seed = np.arange(self.worth), seed_of(self.setting.seed, "test")
+        index, seed = np.arange(self.worth), self.test_seed
         cube = points.points_of(self.ranges, index, seed)
         free = np.random.default_rng(self.setting.seed).random((self.tasks, len(task)))
         options = {"setting": self.setting, "progress": False, "slots": 8}

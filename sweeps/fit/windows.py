@@ -12,17 +12,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.engines import device
 from rps_jax.physics import get_engine
 from rps_jax.questions import Run, Section, call_of, option
 from rps_jax.trials.progress import set_phase
-from rps_jax.tuning.fit import SAMPLES, Fit, Fitted, coordinates, summary
+from rps_jax.tuning.fit import SAMPLES, Fit, coordinates, summary
 from rps_jax.world import points
 from sweeps.fit import least_squares
 from sweeps.fit.least_squares import LEAST_WINDOWS, Replay, Track
@@ -80,7 +79,7 @@ class FitWindows(Fit):
         seed, names = self.setting.seed, points.names(self.ranges)
         index = np.arange(self.num_trials() or 0)
         start = points.points_of(self.ranges, index, seed)
-        minima = device.standard_jax()(self.replay.minima)(start)
+        minima = self.replay.minima(start)
         u, eigenvalues = least_squares.sample(self.replay, *minima, SAMPLES, seed)
         data = summary(self.ranges, u[:, [names.index(x) for x in coordinates(self.ranges)]])
         words = {"units": "1", "long_name": "eigenvalue of the scaled J^T J, in units of the cube"}
@@ -96,7 +95,7 @@ class FitWindows(Fit):
         """Use of the worlds, for reports."""
         return f"in which {self.replay.num_windows} windows of the logs are replayed"
 
-    def report(self, results: Fitted, run: Run) -> Sequence[Section]:
+    def report(self, results: Any, run: Run) -> Sequence[Section]:
         """Add to the report of `rps fit` what the windows determine."""
         data, (first, *rest) = results.data, super().report(results, run)
         text = (

@@ -29,19 +29,17 @@ import xarray as xr
 from rps_jax import Details, Law, Robot, Rules, Setting, Twist
 from rps_jax.control.laws import force_push_published as force_push
 from rps_jax.control.laws.force_push import steer
-from rps_jax.control.laws.force_push_published import PublishedForcePushParams
-from rps_jax.control.observation import ForceObservation
 from rps_jax.geometry import planar, polyline, solid
 from rps_jax.geometry.solid import Solid
-from rps_jax.physics import EngineName, Physics
+from rps_jax.laws import resolve_law
+from rps_jax.physics import FRICTION, EngineName, Physics
 from rps_jax.robot.base import LoadCell, Odometry
 from rps_jax.robot.shell import Boards
 from rps_jax.trials import trial
-from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.trials.trial import ControlLoop, Shift, Snapshot, Trial
 from rps_jax.trials.worlds import build
-from rps_jax.world.scene import JOINTS, Friction, WorldInputs
+from rps_jax.world.scene import JOINTS, WorldInputs
 from rps_jax.worlds import Case, Polyline
 from sweeps.study_base import Rows
 
@@ -50,7 +48,9 @@ SLIDERS: tuple[SliderName, ...] = get_args(SliderName)
 LawName = Literal["force_push", "open_loop"]
 LAWS: tuple[LawName, ...] = get_args(LawName)
 # Their controller, of their simulations: a gain k_y of 0.1 and their full speed.
-PARAMS = PublishedForcePushParams(k_y=0.1, k_omega=0.0, k_f=0.003, v_max=0.1, d_success=1e-6)
+PARAMS: Any = resolve_law("force_push_published")[1]._replace(
+    k_y=0.1, k_omega=0.0, k_f=0.003, v_max=0.1, d_success=1e-6
+)
 INERTIAS = ("half", "even", "greatest")  # of a slider that is even, and with its mass at the edge
 FRICTIONS = (0.0, 0.5, 1.0)  # [1] of the contact
 LATERALS = (-0.4, 0.0, 0.4)  # [m] of the slider's middle, left of the path
@@ -106,12 +106,12 @@ def build_law(
     """
     line: Any = jax.tree.map(jnp.asarray, Polyline.through(curve(radius, _END)))
 
-    def init(params: PublishedForcePushParams) -> FollowingState:
+    def init(params: Any) -> FollowingState:
         zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
         return FollowingState(zero, zero, jnp.zeros((), bool), zero, zero, zero)
 
     def step(
-        params: PublishedForcePushParams, state: FollowingState, observation: ForceObservation
+        params: Any, state: FollowingState, observation: Any
     ) -> tuple[FollowingState, Twist, Details]:
         touch = observation.touch
         period, zero = touch.period, jnp.zeros_like(touch.yaw)
@@ -193,7 +193,7 @@ def starts(slider: SliderName, grid: Cells) -> np.ndarray:
     return qpos
 
 
-def worlds(slider: SliderName, grid: Cells, engine: EngineName) -> WorldBatch:
+def worlds(slider: SliderName, grid: Cells, engine: EngineName) -> Any:
     """Return the worlds of cells of the grid, on the host."""
     count = grid.angle.size
     half = np.full(count, _HALF)
@@ -207,7 +207,9 @@ def worlds(slider: SliderName, grid: Cells, engine: EngineName) -> WorldBatch:
         inertia=moments(slider)[grid.inertia],
         q_object_body=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
     )
-    friction = Friction(np.full(count, GROUND), np.maximum(grid.friction, _LEAST_FRICTION))
+    friction = FRICTION["S1"]._replace(
+        ground=np.full(count, GROUND), robot=np.maximum(grid.friction, _LEAST_FRICTION)
+    )
 
     def repeated(tree: Any) -> Any:
         return jax.tree.map(lambda x: np.repeat(np.asarray(x, float)[None], count, axis=0), tree)

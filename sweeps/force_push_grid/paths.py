@@ -34,7 +34,15 @@ from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, call_of, opt
 from rps_jax.world.tasks.path import Path
 from rps_jax.worlds import parse_domain
 from sweeps.force_push_grid import grid
-from sweeps.study_base import PlanStudy, QuickStudy, Rows, Table, part_name, run_plans
+from sweeps.study_base import (
+    PlanStudy,
+    QuickStudy,
+    Rows,
+    Table,
+    median_interval,
+    part_name,
+    run_plans,
+)
 
 POINT = "force_push, with a point"  # their law with their pusher
 RADII = {"straight": math.inf, "4 m": 4.0, "2 m": 2.0, "1 m": 1.0}  # [m] of the turn
@@ -171,14 +179,12 @@ def best_lookaheads(results: xr.DataTree) -> dict[str, xr.Dataset]:
     return by_law
 
 
-def median(values: np.ndarray, resamples: int = 500) -> tuple[float, float, float]:
+def median(values: np.ndarray) -> tuple[float, float, float]:
     """Return the median of finite values (n,), and its bootstrap 95 % interval."""
     values = values[np.isfinite(values)]
     if not values.size:
         return math.nan, math.nan, math.nan
-    again = np.random.default_rng(0).choice(values, (resamples, values.size))
-    low, high = np.quantile(np.median(again, axis=1), [0.025, 0.975])
-    return float(np.median(values)), float(low), float(high)
+    return median_interval(values, 500)
 
 
 def table(by_law: Mapping[str, xr.Dataset]) -> Rows:

@@ -14,15 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import Rules, Setting, errors
+from rps_jax import Rules, Setting
 from rps_jax.questions import Run, call_of, option
 from rps_jax.runs import evaluate
-from rps_jax.runs.evaluate import Candidates, CandidateScores
 from rps_jax.runs.question import SimulationQuestion
 from rps_jax.tuning import gradients
 from rps_jax.tuning.descent import TuneGrad
-from rps_jax.tuning.evolution import Descent, TuneES
-from sweeps.gradients.race import COUNTS, Lockstep, PacedGrad, interval
+from rps_jax.tuning.evolution import TuneES
+from sweeps.gradients.race import COUNTS, Lockstep, PacedGrad, check_counts, interval
 from sweeps.study_base import Parts, Study, Table
 
 
@@ -51,8 +50,7 @@ class Direction(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     def check(self) -> None:
         """Check that the counts exist."""
         super().check()
-        for count in self.counts:
-            errors.check_name("count", str(count), [str(x) for x in COUNTS])
+        check_counts(self.counts)
 
     def parts(self, run: Run) -> Parts:
         """Return the function that measures each count."""
@@ -91,11 +89,11 @@ class Direction(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     def _with_seed(self, seed: int) -> Setting:
         return replace(self.setting, seed=seed)
 
-    def _gradient(self, question: Descent) -> tuple[Any, float, float]:
+    def _gradient(self, question: Any) -> tuple[Any, float, float]:
         """Return gradient (p,), error and simulated time [s] of the first step of a tuning."""
         simulated = [0.0]
 
-        def score(requests: list[Candidates]) -> list[CandidateScores]:
+        def score(requests: list[Any]) -> list[Any]:
             scores, timing = evaluate.score_candidates(
                 requests, question.setting, question.objective
             )

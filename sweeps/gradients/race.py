@@ -28,8 +28,9 @@ from rps_jax import RPSParams, Rules, Setting, errors, evaluate
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.control import registry
 from rps_jax.control.base import entries
+from rps_jax.laws import resolve_law
 from rps_jax.questions import Picture, Run, call_of, option
-from rps_jax.runs.evaluate import Candidates, CandidateScores, score_candidates
+from rps_jax.runs.evaluate import score_candidates
 from rps_jax.runs.question import SimulationQuestion
 from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.tuning.descent import TuneGrad
@@ -64,10 +65,10 @@ class Lockstep:
         self.count = count
         self.device = threading.Lock()  # one tuning differentiates at a time
         self.programs: dict[Callable[..., Any], Any] = {}  # of all tunings
-        self._waiting: list[tuple[Tuning, list[Candidates], list[Any]]] = []
+        self._waiting: list[tuple[Tuning, list[Any], list[Any]]] = []
         self._changed = threading.Condition()
 
-    def score(self, question: Tuning, tried: list[Candidates]) -> tuple[Any, Timing]:
+    def score(self, question: Tuning, tried: list[Any]) -> tuple[Any, Timing]:
         """Return the scores of candidates, once all tunings ask for some.
 
         A tuning has the share of the wall clock that its trials have of the simulated time.
@@ -111,7 +112,7 @@ class _Paced(Tuning):
 
     pool: ClassVar[Lockstep]
 
-    def _score(self, tried: list[Candidates], run: Run) -> tuple[list[CandidateScores], Timing]:
+    def _score(self, tried: list[Any], run: Run) -> tuple[list[Any], Timing]:
         return self.pool.score(self, tried)
 
     def _test(self, best: np.ndarray, run: Run) -> xr.Dataset:
@@ -213,8 +214,9 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def check(self) -> None:
         super().check()
-        for count in self.counts:
-            errors.check_name("count", str(count), [str(x) for x in COUNTS])
+        check_counts(self.counts)
+        if not (self.simulated or self.wall):
+            raise errors.InputError("simulated and wall are empty: give a budget of one of them.")
 
     def parts(self, run: Run) -> Parts:
         """Return the function that runs and tests the tunings of each count."""
@@ -324,6 +326,12 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 race = call_of(Race)
 
 
+def check_counts(counts: Sequence[int]) -> None:
+    """Check that there are problems with these numbers of parameters."""
+    for count in counts:
+        errors.check_name("count", str(count), [str(x) for x in COUNTS])
+
+
 def spent(curve: pd.DataFrame, budget: str) -> Any:
     """Return what the vector of each generation of a log has cost: all generations before it [s].
 
@@ -355,7 +363,7 @@ def learned_curve(folder: Path) -> pd.DataFrame:
 
 def problem(count: int) -> tuple[Any, str]:
     """Return the law at the start and the domain of the test worlds of a problem."""
-    _, start = registry.parse_law(COUNTS[count].get("law", "rps"))
+    _, start = resolve_law(COUNTS[count].get("law", "rps"))
     (domain,), objects = COUNTS[count].get("domain", ("wide",)), COUNTS[count].get("objects", ())
     return start, ",".join([domain, *(f"objects={name}" for name in objects)])
 

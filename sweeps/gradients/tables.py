@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import Law, RPSParams, RPSState, register_law
-from rps_jax.control.laws import rps
 from rps_jax.control.observation import displacement
 from rps_jax.geometry import planar
-from rps_jax.laws import Bound
+from rps_jax.laws import Bound, law_of
 
 _NEAR, _FAR, _WIDE = 0.05, 3.0, 0.3  # [m]
+_RPS: Any = law_of(RPSParams.paper())
 
 
 class Tables(NamedTuple):
@@ -81,14 +81,14 @@ def step(params: Tables, state: RPSState, obs: Any, temperatures: Any = None) ->
     v = jnp.abs(filled.l) / _WIDE
     eta, gain = (jnp.exp(interpolate(x, u, v)) for x in (params.eta, params.K_h))
     changed = params.rps._replace(eta=params.rps.eta * eta, K_h=params.rps.K_h * gain)
-    return rps.step_with_details(changed, state, obs, temperatures)
+    return _RPS.step(changed, state, obs, temperatures)
 
 
 LAW = Law(
     init,
     step,
     bounds={"eta": Bound(-2.0, 2.0), "K_h": Bound(-2.0, 2.0)},
-    temperatures=rps.Temperatures(),
+    temperatures=_RPS.temperatures,
 )
 for kind, shape in ((Table64, (8, 4)), (Table512, (16, 16)), (Table2048, (32, 32))):
     zeros = np.zeros(shape)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
@@ -23,7 +23,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.solid import GRAVITY, Solid
 from rps_jax.physics import FRICTION, Physics
 from rps_jax.world import scene
-from rps_jax.world.scene import JOINTS, Scene
+from rps_jax.world.scene import JOINTS
 from sweeps.ground import rigid
 from sweeps.ground.rigid import Pushed, Rounding
 
@@ -81,7 +81,7 @@ def targets() -> dict[str, Target]:
     }
 
 
-def scene_of(target: Target, physics: Physics) -> Scene:
+def scene_of(target: Target, physics: Physics) -> Any:
     """Compile the scene of pushes of an object."""
     single = jax.tree.map(lambda leaf: leaf[0], target.solid)
     return scene.compile_solid(target.family, single, physics)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,7 @@ from rps_jax.geometry.solid import GRAVITY
 from rps_jax.physics import PHYSICS, ControlPeriod, EngineName, Motion, Physics, get_engine, preset
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.worlds import starts
-from rps_jax.world import draws
-from rps_jax.world.draws import Draw
+from rps_jax.world import points
 from rps_jax.world.physics import MUJOCO_GROUND
 from rps_jax.world.scene import WorldInputs
 from rps_jax.worlds import parse_domain
@@ -96,7 +95,7 @@ class Straight(QuickStudy[xr.Dataset]):
         force, spread, friction = np.zeros((3, self.worlds))
         for i, family in enumerate(CENTRED.families):
             rows = index[CENTRED.object_of(index) == i]
-            drawn = draws.draw(CENTRED, self.seed, rows)
+            drawn = points.draw(CENTRED, self.seed, None, rows)
             late = push(family, drawn, kind) / (drawn.friction.ground * drawn.solid.mass * GRAVITY)
             force[rows], spread[rows] = late.mean(axis=0), late.std(axis=0)
             friction[rows] = drawn.friction.ground
@@ -121,7 +120,7 @@ class Straight(QuickStudy[xr.Dataset]):
 straight = call_of(Straight)
 
 
-def push(family: str, drawn: Draw, kind: Kind) -> np.ndarray:
+def push(family: str, drawn: Any, kind: Kind) -> np.ndarray:
     """Return push forces (steps, n) [N] of the second half of straight pushes, one each step.
 
     Objects of a draw (n,) settle first. A side of a prism is flush with the front of the base.

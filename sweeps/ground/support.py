@@ -17,7 +17,7 @@ import rps_jax
 from rps_jax import Range, Setting
 from rps_jax.analysis import statistics
 from rps_jax.questions import Run, call_of, option
-from rps_jax.studies import hardware
+from rps_jax.world import paper
 from rps_jax.worlds import parse_domain
 from sweeps.study_base import Parts, QuickStudy, Table, records, text_table
 
@@ -66,7 +66,7 @@ class Support(QuickStudy[xr.Dataset]):
         setting = Setting(physics=f"default,support={kind}")
         domain = replace(
             parse_domain("hardware"),
-            targets=hardware.Hardware().targets,
+            targets=paper.HARDWARE_LAYOUTS["circle"],
             friction_robot=Range(mu, mu),
             lateral=Range(-0.03, 0.03),  # by hand, within 3 cm and 3 degrees
             yaw=Range(-0.0524, 0.0524),

@@ -9,7 +9,7 @@ and around sets of parameters. Both push with a few hundred candidates: for a GP
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, Literal
 
@@ -23,11 +23,11 @@ from rps_jax.laws import law_of
 from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.progress import SequentialProgress
-from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Outcome
-from rps_jax.tuning.space import SUBSETS
 from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.landscape.candidates import aims, cloud, front_table, lines, undominated
+
+_NAMES = tuple(dict(law_of(RPSParams.paper()).bounds))  # of the varied parameters
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
     def _shares(self) -> tuple[int, int]:
         """Numbers of trials of both parts."""
         per_candidate = len(self.domains) * self.worlds
-        varied = len(self.chosen) * len(SUBSETS["full"]) * self.values
+        varied = len(self.chosen) * len(_NAMES) * self.values
         return varied * per_candidate, 2 * (self.candidates + len(self.chosen)) * per_candidate
 
     def num_trials(self) -> int | None:
@@ -97,7 +97,8 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
         **options: Any,
     ) -> list[Outcome]:
         """Return the outcomes (P, D * W) of candidates (P,) in the worlds of each split."""
-        seeds, worlds = [seed_of(self.setting.seed, x) for x in splits], np.arange(self.worlds)
+        seeds = [replace(self.setting, split=x).world_seed for x in splits]
+        worlds = np.arange(self.worlds)
         requests = [Candidates(params, self.domains, seed, worlds) for seed in seeds]
         return outcomes(requests, self.setting, **options)[0]
 
@@ -106,7 +107,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
 
         Return labelled results (set, parameter, step), with the parameter's `value` at each step.
         """
-        names, dims = SUBSETS["full"], ("set", "parameter", "step")
+        names, dims = _NAMES, ("set", "parameter", "step")
         by_set = [lines(base, names, self.values) for base in self._sets]
         grid = jax.tree.map(lambda *x: np.stack(x), *by_set)
         (outcome,) = self._outcomes(jax.tree.map(np.ravel, grid), "validate", **options)
@@ -125,7 +126,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
         The selection uses validation worlds. The objectives (candidate,) are then measured in test
         worlds, so that the selection does not bias them.
         """
-        names, sets = SUBSETS["full"], self._sets
+        names, sets = _NAMES, self._sets
         params = cloud(sets, names, self.candidates, self.spread, self.setting.seed)
         validated, tested = self._outcomes(params, "validate", "test", **options)
         columns = {

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import Details, Law, Observation, RPSParams, RPSState, Twist, register_law
-from rps_jax.control.laws import rps, rps_plus
+from rps_jax.control.laws import rps_plus
 from rps_jax.control.observation import displacement
 from rps_jax.geometry import planar
 from rps_jax.laws import law_of, resolve_law
@@ -74,7 +74,8 @@ def step(
     flush &= (params.agree == 0) | (jnp.sign(l) * error > 0.05)
     omega = jnp.sign(l) * params.flush * params.law.omega_max
     pressing = jnp.array([1.0, 0.0]) * params.forward * params.law.v_max
-    turning = rps.saturate(params.law, Twist.from_point_velocity(contact, pressing, omega))
+    turning = Twist.from_point_velocity(contact, pressing, omega)
+    turning = turning.saturate(params.law.v_max, params.law.omega_max)
     p_world = obs.p_world_robot + planar.rotate(obs.yaw, contact)
     felt = jnp.where(touching, p_world, state.p_world_felt)
     lost = jnp.where(touching, 0.0, state.lost + rps_state.touched)

@@ -21,7 +21,6 @@ from rps_jax import Setting, errors
 from rps_jax.analysis import tables
 from rps_jax.laws import LawParams, LawsLike
 from rps_jax.questions import Plan, Run, Section, call_of, option
-from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.sweep import SweepQuestion
 from rps_jax.worlds import DomainLike
 from sweeps.mends.mended import FIRST, MENDS
@@ -66,7 +65,7 @@ class Mends(SweepQuestion):
         """Return sections that compare each addition with the first, world by world."""
         rows = tables.against_table(results, FIRST)
         compared = Section(f"Against: {FIRST}", "World by world; p by Holm.", rows)
-        return [compared, sweeps.success_section(results, float(self.plan.setting.rules.max_lost))]
+        return [compared, super().report(results, run)[0]]
 
 
 mends = call_of(Mends)

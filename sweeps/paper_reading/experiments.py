@@ -19,12 +19,10 @@ from rps_jax.physics import FRICTION, PHYSICS
 from rps_jax.questions import Run
 from rps_jax.trials import pushes
 from rps_jax.trials.batch_run import Candidates, outcomes
-from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.trial import Outcome
 from rps_jax.world import paper, points, scene
-from rps_jax.world.draws import Draw
 from rps_jax.worlds import parse_domain
 from sweeps.paper_reading import printed
 from sweeps.paper_reading.printed import SHORT
@@ -77,7 +75,7 @@ class _Trials(Candidates):
     is_far: np.ndarray | None = None  # (W,) whether the nonuniform box has its load at the far side
 
     @functools.cached_property
-    def draws(self) -> list[tuple[np.ndarray, Domain, Draw]]:
+    def draws(self) -> list[tuple[np.ndarray, Domain, Any]]:
         """Worlds by domain and object, with the load of the nonuniform box at its side."""
         if self.is_far is None:
             return super().draws
@@ -89,7 +87,7 @@ class _Trials(Candidates):
             placed.append((at, domain, drawn._replace(solid=solid)))
         return placed
 
-    def batches(self, setting: Setting) -> Iterator[WorldBatch]:
+    def batches(self, setting: Setting) -> Iterator[Any]:
         """Yield the worlds, with the tolerance of each."""
         for batch in super().batches(setting):
             if self.tolerance is None:

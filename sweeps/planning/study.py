@@ -21,13 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import Domain, Range, Setting
+from rps_jax import Domain, Range, Setting, draw_worlds
 from rps_jax.analysis.figures.style import Figure, base_patch, tiles, words
 from rps_jax.physics import PHYSICS, EngineName, Motion, get_engine
 from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials.trial import World, object_pose
-from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import draws
 from rps_jax.worlds import parse_domain
 from sweeps.planning import plans
 from sweeps.planning.plans import KNOTS, METHODS, Method, Problem, Simulator, Start
@@ -153,7 +151,7 @@ def worlds_of(
 ) -> tuple[World, Any]:
     """Return the first worlds (count, ...) of one object, and their stage."""
     domain = replace(domain, objects=(name,))
-    part = drawn_worlds(domain, draws.draw(domain, seed, np.arange(count)), Setting(engine))
+    part = draw_worlds(domain, count, setting=Setting(engine, seed=seed))
     worlds = jax.tree.map(lambda x: jnp.asarray(x, float), part.worlds._replace(key=None))
     return worlds, part.stage
 

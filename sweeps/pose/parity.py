@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -15,17 +16,15 @@ import xarray as xr
 from rps_jax import Setting
 from rps_jax.analysis import tables
 from rps_jax.questions import Plan, Run, call_of, option
-from rps_jax.runs.question import TrialQuestion
-from rps_jax.runs.sweep import Sweep
 from sweeps.pose.study import CASES, LOOSE, TIGHT, YAW
-from sweeps.study_base import Rows, Study, Table, run_plans
+from sweeps.study_base import PlanStudy, Rows, Table, TrialStudy, plan_of, run_plans
 
 ENGINES = ("fused", "mujoco")
 _CASE = "wide, boxes | omnidirectional | 0.2 m/s"
 
 
 @dataclass(frozen=True)
-class Parity(TrialQuestion[xr.Dataset], Study[xr.Dataset]):
+class Parity(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
     """Compare the outcomes of poses in two engines, in equal worlds."""
 
     TITLE: ClassVar[str] = "Poses in two engines"
@@ -35,25 +34,13 @@ class Parity(TrialQuestion[xr.Dataset], Study[xr.Dataset]):
     """Number of worlds."""
     setting: Setting = field(default=Setting("fused", seed=7072), kw_only=True)
 
-    @property
+    @cached_property
     def plans(self) -> dict[str, Plan]:
         """The sweep of each engine."""
         case = CASES[_CASE]
-        options = {"robot": case.robot, "task": "pose"}
-        return {
-            name: Sweep(
-                case.law,
-                case.domain,
-                self.worlds,
-                setting=replace(self.setting, engine=name),
-                **options,
-            ).plan
-            for name in ENGINES
-        }
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return len(ENGINES) * self.worlds
+        plan = plan_of(case.law, case.domain, self.worlds, self.setting, case.robot, "pose")
+        settings = {name: replace(self.setting, engine=name) for name in ENGINES}
+        return {name: replace(plan, setting=setting) for name, setting in settings.items()}
 
     def answer(self, run: Run) -> xr.Dataset:
         """Sweep each engine."""

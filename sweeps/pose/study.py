@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -15,9 +16,7 @@ import xarray as xr
 from rps_jax import Setting
 from rps_jax.analysis import tables
 from rps_jax.questions import Plan, Run, call_of, option
-from rps_jax.runs.question import TrialQuestion
-from rps_jax.runs.sweep import Sweep
-from sweeps.study_base import Rows, Study, Table, run_plans
+from sweeps.study_base import PlanStudy, Rows, Table, TrialStudy, plan_of, run_plans
 
 YAW, TIGHT, LOOSE = 0.1, 0.02, 0.05  # [rad], [m] tolerances of the table
 FREE = ",v_free=0.2,omega_free=0.5"
@@ -54,12 +53,17 @@ CASES: dict[str, Case] = {
     ),
 }
 OUTCOMES = (
-    *("time", "contact_lost_time", "place_error", "sideways_error", "heading_error", "declared"),
+    "time",
+    "contact_lost_time",
+    "place_error",
+    "sideways_error",
+    "heading_error",
+    "declared",
 )
 
 
 @dataclass(frozen=True)
-class Poses(TrialQuestion[xr.Dataset], Study[xr.Dataset]):
+class Poses(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
     """Deliver objects of several domains to poses, with two bases and two free speeds.
 
     The results hold the outcomes (row, world).
@@ -75,31 +79,15 @@ class Poses(TrialQuestion[xr.Dataset], Study[xr.Dataset]):
     """Number of worlds of each row."""
     setting: Setting = field(default=Setting("fused", seed=7072), kw_only=True)
 
-    @property
+    @cached_property
     def plans(self) -> dict[str, Plan]:
         """The sweep of each row."""
-        sweeps = {
-            name: Sweep(
-                CASES[name].law,
-                CASES[name].domain,
-                self.worlds,
-                robot=CASES[name].robot,
-                task=f"pose,d_success={LOOSE},yaw_success={YAW}",
-                setting=self.setting,
-            )
-            for name in self.cases
+        task = f"pose,d_success={LOOSE},yaw_success={YAW}"
+        cases = {name: CASES[name] for name in self.cases}
+        return {
+            name: plan_of(x.law, x.domain, self.worlds, self.setting, x.robot, task)
+            for name, x in cases.items()
         }
-        return {name: sweep.plan for name, sweep in sweeps.items()}
-
-    def check(self) -> None:
-        """Check that the engine can step these worlds here."""
-        super().check()
-        for plan in self.plans.values():
-            plan.check_here()
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return len(self.cases) * self.worlds
 
     def answer(self, run: Run) -> xr.Dataset:
         """Sweep each row."""

@@ -359,8 +359,6 @@ RECIPES: dict[str, Recipe] = {
         cores=40,
     ),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
-    "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
-    "extras": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
     **dict.fromkeys(
         ("fit_coverage", "fit_quantities", "fit_worth"),
         recipe(f"rps sweeps/fit {_MACHINE}", cores=15),

@@ -22,9 +22,9 @@ from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.laws import resolve_law
 from rps_jax.questions import Plan, Run, call_of, option
-from rps_jax.runs import execution, model_panel
+from rps_jax.runs import model_panel
 from rps_jax.worlds import parse_domain
-from sweeps.study_base import Rows, Table, TrialStudy, stored_parts
+from sweeps.study_base import Rows, Table, TrialStudy, run_plans, stored_parts
 
 IN_C = "C MuJoCo, this ground, 10 ms"
 
@@ -132,7 +132,7 @@ random_worlds = call_of(RandomWorlds)
 
 def _outcomes(plan: Plan, run: Run) -> xr.Dataset:
     """Return success (law, world) and the time of each trial [s]."""
-    results = execution.run_plan(plan, None, **run.batch_options)
+    results = run_plans(run._replace(folder=None), {"": plan})[""]
     results = results[["success", "time"]].reset_coords(drop=True)
     return results.assign(success=results.success.astype(np.float32))
 

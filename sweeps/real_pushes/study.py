@@ -29,7 +29,7 @@ from rps_jax.questions import Picture, Run, call_of, option
 from sweeps.real_pushes import contact, pushes
 from sweeps.real_pushes.drawing import figure
 from sweeps.real_pushes.pushes import Errors
-from sweeps.study_base import QuickStudy, Table, run_parts
+from sweeps.study_base import QuickStudy, Table, median_interval, run_parts
 
 WORDS: Mapping[str, str] = {
     "no_motion": "no motion",
@@ -301,13 +301,6 @@ def _csv(results: xr.Dataset) -> str:
     poses = {f"post_{name}": results.predicted.sel(pose=name, drop=True) for name in pushes.POSE}
     frame = xr.Dataset(poses).to_dataframe().reset_index()[["id", "model", *poses]]
     return frame.dropna().to_csv(index=False, lineterminator="\n")
-
-
-def median_interval(values: np.ndarray) -> tuple[float, float, float]:
-    """Return the median of values (n,) and its 95 % interval by a bootstrap."""
-    drawn = np.random.default_rng(0).choice(values, (_DRAWS, values.size))
-    low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
-    return float(np.median(values)), float(low), float(high)
 
 
 def _column(name: str, form: str = "{}", rest: str = "", **options: Any) -> dict[str, Any]:

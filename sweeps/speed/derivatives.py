@@ -9,6 +9,7 @@ reverse mode through all control steps, and includes its own forward run.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from rps_jax.trials.batch_run import Candidates
 from rps_jax.trials.trial import ControlLoop, advance, start_all, unroll
 from rps_jax.trials.worlds import soften_skins
 from rps_jax.worlds import parse_domain
+from sweeps.speed.study import best
 from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table
 
 _ROUNDS = 5  # of which the fastest counts
@@ -127,9 +129,5 @@ derivatives = call_of(Derivatives)
 
 def _timed(program: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
     """Return the results of a program, and its fastest time [s]."""
-    results, times = jax.block_until_ready(program(*arguments)), []
-    for _ in range(_ROUNDS):
-        start = time.perf_counter()
-        jax.block_until_ready(program(*arguments))
-        times.append(time.perf_counter() - start)
-    return results, min(times)
+    results = jax.block_until_ready(program(*arguments))
+    return results, best(lambda: jax.block_until_ready(program(*arguments)), _ROUNDS, math.inf)

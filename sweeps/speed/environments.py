@@ -7,8 +7,8 @@ rps sweeps/speed/environments.py --worlds 4096 --file environments_gpu
 from __future__ import annotations
 
 import contextlib
+import math
 import re
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +23,7 @@ import xarray as xr
 import rps_jax
 from rps_jax import Setting
 from rps_jax.questions import Run, call_of, option
+from sweeps.speed.study import best
 from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table
 
 _ROOT = Path(__file__).parents[2]
@@ -118,9 +119,6 @@ environments = call_of(Environments)
 
 def _timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
     """Return the time of the first run [s], with the compilation, and that of the fastest [s]."""
-    program, times = jax.jit(function), []
-    for _ in range(1 + _ROUNDS):
-        start = time.perf_counter()
-        jax.block_until_ready(program(*arguments))
-        times.append(time.perf_counter() - start)
-    return times[0], min(times[1:])
+    program = jax.jit(function)
+    run = lambda: jax.block_until_ready(program(*arguments))  # noqa: E731
+    return best(run, 1), best(run, _ROUNDS, math.inf)

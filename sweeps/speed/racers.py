@@ -144,7 +144,7 @@ def jax_engine(task: Task, name: str) -> Racer:
     worlds, periods = len(task.qpos), round(task.seconds / physics.control_period)
     box = solid.stack([scene.load("box", physics).solid])
     boxes = jax.tree.map(lambda leaf: np.repeat(leaf, worlds, axis=0), box)
-    friction = scene.Friction(*(np.full(worlds, x) for x in FRICTION["S1"]))
+    friction = jax.tree.map(lambda x: np.full(worlds, x), FRICTION["S1"])
     stage, fields = get_engine(name).stage(scene.WorldInputs("box", boxes, friction, physics))
     fields, qpos = jax.device_put((fields, task.qpos.astype(np.float32)))
     twists = Twist(*(jnp.full(worlds, v, jnp.float32) for v in (SPEED, 0.0, 0.0)))

@@ -67,7 +67,7 @@ def axis_label(name: str, units: str) -> str:
 
 
 def tiles(
-    count: int, columns: int, size: tuple[float, float], margin: tuple[float, float], **shared: Any
+    count: int, columns: int, size: tuple[float, float], margin: tuple[float, float], **shared: bool
 ) -> tuple[Figure, np.ndarray]:
     """Return a figure and its panels (rows, columns) of one size [in]; unused panels are hidden."""
     columns = min(columns, count)

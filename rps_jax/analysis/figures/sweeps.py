@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -46,7 +47,8 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
         "Less influential": _names([x for x in rest if not _is_flat(x)], spread=True),
         "Flat within the noise": _names([x for x in rest if _is_flat(x)]),
     }
-    caption = "\n".join(_filled(f"{k}: {v}.", columns * width) for k, v in parts.items() if v)
+    fill = partial(textwrap.fill, width=int(_LETTERS * columns * width), break_on_hyphens=False)
+    caption = "\n".join(fill(f"{k}: {v}.") for k, v in parts.items() if v)
     laws = results.law.values.tolist()
     lines = len(caption.splitlines()) + len(laws) / columns + 4
     figure, axes = tiles(len(shown), columns, (width, 1.9), (0, 0.14 * lines), sharey=True)
@@ -72,11 +74,6 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     figure.legend(handles, names, title=title, loc="outside upper left", **legend)
     figure.supxlabel(caption, x=0.01, ha="left")
     return figure
-
-
-def _filled(text: str, width: float) -> str:
-    """Break a text into lines of this width [in]."""
-    return textwrap.fill(text, int(_LETTERS * width), break_on_hyphens=False)
 
 
 def _is_flat(influence: Influence) -> bool:

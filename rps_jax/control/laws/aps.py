@@ -82,11 +82,13 @@ class APSState(NamedTuple):
     def init(cls, params: APSParams) -> APSState:
         """Return the state before the first observation, with the prior alone."""
         zero = jnp.zeros_like(jnp.asarray(params.K1, float))
-        return cls(
-            jnp.zeros(2, zero.dtype),
-            *(zero, jnp.zeros((), bool), zero, zero, zero, zero),
-            *(zero + params.alpha_mean, zero + params.alpha_variance, zero + params.alpha_count),
-            zero,
+        fresh = cls(*[zero] * len(cls._fields))
+        return fresh._replace(
+            p_world_object=jnp.zeros(2, zero.dtype),
+            started=zero > 0,
+            mean=zero + params.alpha_mean,
+            variance=zero + params.alpha_variance,
+            weight=zero + params.alpha_count,
         )
 
 

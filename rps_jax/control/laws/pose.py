@@ -181,19 +181,16 @@ def init(params: PoseParams, temperatures: Smooth | None = None) -> PoseState:
     zero = jnp.zeros_like(jnp.asarray(params.r, float))
     count, no, point = jnp.zeros((), jnp.int32), zero > 0, jnp.zeros(2, zero.dtype)
     sides = jnp.zeros(4, zero.dtype)
-    return PoseState(
+    names = ("p_world_contact", "p_world_front", "p_world_base")
+    return PoseState(*[zero] * len(PoseState._fields))._replace(
         mode=count,
         leg=count,
         h=sides,
         known=sides > 0,
         centred=point > 0,
-        p_world_contact=point,
-        p_world_front=point,
-        p_world_base=point,
-        twist=jnp.zeros(3, zero.dtype),
+        twist=sides[:3],
+        **dict.fromkeys(names, point),
         **dict.fromkeys(("touched", "looking", "done"), no),
-        **dict.fromkeys(("yaw", "time", "t_lost", "t_push", "t_even", "look"), zero),
-        **dict.fromkeys(("looks", "tries", "wider"), zero),
         **dict.fromkeys(("side", "gear"), zero + 1),
     )
 
@@ -206,17 +203,17 @@ def _turned(values: Array, leg: Array) -> Array:
     return turned
 
 
-def _turned2(values: Array, leg: Array) -> Array:
-    """Return values (2,) of the two axes, from that of a leg on."""
-    return jnp.where(leg % 2 == 1, values[::-1], values)
-
-
 class Box(NamedTuple):
     """Box that the law remembers, in the frame of the goal or of a leg."""
 
     h: Array  # (4,) [m] supports ahead, left, behind and right
     known: Array  # (4,) bool
     centred: Array  # (2,) bool: along and across
+
+    def turned(self, leg: Array) -> "Box":
+        """Return the box from the direction of a leg on."""
+        centred = jnp.where(leg % 2 == 1, self.centred[::-1], self.centred)
+        return Box(_turned(self.h, leg), _turned(self.known, leg), centred)
 
 
 def feel(
@@ -226,7 +223,8 @@ def feel(
 
     `front` and `lateral` [m] are the positions of the front along, and of the base across the leg.
     """
-    (ahead, left, behind, right), known, centred = box
+    (ahead, _, behind, _), known, centred = box
+    sides, was_known = box.h[1::2], known[1::2]
     flush = obs.even & (t_even > _FLUSH)
     # The pushed face: the box moves with it, or another face is there and the middle stays.
     near = -front
@@ -238,21 +236,21 @@ def feel(
     ahead, behind = jnp.where(obs.even, far, ahead), jnp.where(obs.even, near, behind)
     far_known = known[0] & (same | keeps | ~obs.even)
     # Its ends, as supports to the left and to the right.
-    felt = jnp.stack([lateral + obs.ends[0], -(lateral + obs.ends[1])])
-    sides, seen = jnp.stack([left, right]), obs.seen & flush
-    is_known = known[1::2] & (felt < sides + _EDGE)
+    felt = (lateral + obs.ends) * jnp.array([1.0, -1.0])
+    seen = obs.seen & flush
+    is_known = was_known & (felt < sides + _EDGE)
     is_same = is_known & (jnp.abs(felt - sides) < _SAME)
     share = jnp.where(t_even > 2 * _FLUSH, 0.1, 0.5)
     measured = jnp.where(is_same, sides + share * (felt - sides), felt)
     # Where one end is seen and not the other, this moves along if the face is the same.
-    is_known = is_known & (~seen[::-1] | is_same[::-1] | ~known[1::2][::-1])
-    change = jnp.where(known[1::2], measured - sides, 0.0)
-    carried = sides - jnp.where(seen[::-1], change[::-1], 0.0)
+    is_known = is_known & (~seen | is_same | ~was_known)[::-1]
+    change = jnp.where(was_known & seen, measured - sides, 0.0)
+    carried = sides - change[::-1]
     sides = jnp.where(seen, measured, jnp.where(is_known, carried, felt))
-    is_known = is_known | seen
-    known = jnp.stack([far_known, is_known[0], known[2] | flush, is_known[1]])
-    centred = jnp.stack([centred[0], centred[1] | flush])
-    return Box(jnp.stack([ahead, sides[0], behind, sides[1]]), known, centred)
+    left, right = is_known | seen
+    known = jnp.stack([far_known, left, known[2] | flush, right])
+    h = jnp.stack([ahead, sides[0], behind, sides[1]])
+    return Box(h, known, centred | jnp.stack([False, flush]))
 
 
 def filtered_pose(params: PoseParams, state: PoseState, obs: Observation) -> tuple[Array, Array]:
@@ -290,8 +288,9 @@ def step(
     u = planar.unit(yaw)
     grid = planar.unit(theta + jnp.arange(4) * (jnp.pi / 2))  # (4, 2) d_j
     p_world_front = base + half_length * u
-    at = {"p_world_robot": base, "yaw": yaw, "in_contact": touches}
-    flat = touch._replace(base_radius=None, half_length=half_length, **at)
+    flat = touch._replace(
+        p_world_robot=base, yaw=yaw, in_contact=touches, base_radius=None, half_length=half_length
+    )
     _, contact, normal, on_front, _ = contact_of(state.p_world_contact, flat)
     p_world_contact = base + planar.rotate(yaw, contact)
     first, touched = touches & ~state.touched, state.touched | touches
@@ -309,17 +308,12 @@ def step(
     )
     leg, fronts, bases = state.leg, grid @ (p_world_front - goal), grid @ (base - goal)
     along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
-    seen_from_leg = Box(_turned(h, leg), _turned(state.known, leg), _turned2(state.centred, leg))
-    felt = feel(params, seen_from_leg, along, across, obs, t_even)
-    felt = Box(
-        _turned(felt.h, -leg % 4), _turned(felt.known, -leg % 4), _turned2(felt.centred, leg)
-    )
+    box = Box(h, state.known, state.centred)
+    felt = feel(params, box.turned(leg), along, across, obs, t_even).turned(-leg % 4)
     middle = p_world_contact + params.r * planar.unit(yaw + normal)
     forgets = first | (feels & (t_even <= _UNEVEN))
-    guess = grid @ (middle - goal) + params.r
-    h = jnp.where(forgets, guess, jnp.where(feels, felt.h, h))
-    known = jnp.where(forgets, False, jnp.where(feels, felt.known, state.known))
-    centred = jnp.where(forgets, False, jnp.where(feels, felt.centred, state.centred))
+    square = Box(grid @ (middle - goal) + params.r, jnp.zeros(4, bool), jnp.zeros(2, bool))
+    h, known, centred = soft.tree_where(forgets, square, soft.tree_where(feels, felt, box))
 
     # Q4 and Q5.
     y, way, way_left = (h[1] - h[3]) / 2, h[2], -fronts[0]
@@ -333,9 +327,8 @@ def step(
     has_looked = both | (state.looks >= params.looks)
     settled = (state.t_push > 2) & has_looked & ((t_even > 1) | (state.t_push > 6))
     room = params.y_tol + params.cap * jnp.maximum(way_left, 0.0)
-    is_off = (
-        last_leg & feels & settled & (jnp.abs(y) > room + 0.01) & may_try & (way_left > s_min - 0.1)
-    )
+    is_off = last_leg & feels & settled & may_try
+    is_off = is_off & (jnp.abs(y) > room + 0.01) & (way_left > s_min - 0.1)
     passed = last_leg & pushing & state.touched & (way_left < -0.03)
     at_end = last_leg & feels & (way_left < params.stop)
     # A drum is never flush: a long push and a repetition are enough.
@@ -404,9 +397,8 @@ def step(
     carrot = _CARROT if omni else _AHEAD
     behind_face = omni & (jnp.abs(face) < 0.1) & (along < -behind - 0.02) & (jnp.abs(offset) < 0.7)
     is_direct = (jnp.abs(turn) < carrot) | behind_face if omni else turn < carrot
-    half_along, half_across = (
-        jnp.clip(x, *_HALF) for x in ((ahead + behind) / 2, (box_left + box_right) / 2)
-    )
+    half_along = jnp.clip((ahead + behind) / 2, *_HALF)
+    half_across = jnp.clip((box_left + box_right) / 2, *_HALF)
     R_s = half_along + half_length + params.gap + axle + wider
     R = params.R + jnp.hypot(half_along, half_across) + axle + wider
     staging = m - jnp.where(behind_face, -jnp.sum(away * ahead_u), R_s) * ahead_u
@@ -418,12 +410,10 @@ def step(
         near = (remaining < 0.02) | ((remaining < 0.3) & (jnp.abs(offset) < 0.02))
         gear, error = state.gear, face
     else:
-        errors = [planar.wrap(heading + x - yaw) for x in (0.0, jnp.pi)]
-        ends = [
-            jnp.where(is_direct, jnp.abs(planar.wrap(psi - heading - x)), jnp.pi / 2)
-            for x in (0.0, jnp.pi)
-        ]
-        costs = [jnp.abs(e) + end for e, end in zip(errors, ends, strict=True)]
+        half_turns = jnp.array([0.0, jnp.pi])  # forwards and in reverse
+        errors = planar.wrap(heading + half_turns - yaw)
+        ends = jnp.abs(planar.wrap(psi - heading - half_turns))
+        costs = jnp.abs(errors) + jnp.where(is_direct, ends, jnp.pi / 2)
         gear = jnp.where(costs[1] < costs[0] + 1.3, -1.0, 1.0)
         gear = jnp.where(state.mode == AROUND, state.gear, gear)
         error = jnp.where(gear > 0, *errors)
@@ -443,10 +433,8 @@ def step(
     bound = soft.where(weight, params.omega_push, params.omega_max)
     omega = jnp.where(touched, jnp.clip(planar.wrap(psi + steer - yaw), -bound, bound), 0.0)
     v = jnp.where(touched, params.v_max, params.v_approach)
-    v_last, v_side = (
-        jnp.clip(0.5 * way_left, 0.01, params.v_max),
-        jnp.clip(-0.5 * beyond_line, 0.015, params.v_max),
-    )
+    v_last = jnp.clip(0.5 * way_left, 0.01, params.v_max)
+    v_side = jnp.clip(-0.5 * beyond_line, 0.015, params.v_max)
     slow = jnp.where(last_leg, v_last, jnp.where(leg % 2 == 1, v_side, v))
     v = soft.where(weight, jnp.where(touched, slow, v), v)
     bound = soft.where(weight, params.slope * v, 0.4 * params.v_max)
@@ -465,44 +453,38 @@ def step(
         v_drive = jnp.where(is_large | arrives, 0.0, gear * params.v_free * jnp.cos(error))
         drive = jnp.stack([v_drive, jnp.zeros_like(v_drive)])
         spin = jnp.where(arrives, 2 * face, jnp.where(is_large, jnp.sign(error) * jnp.pi, error))
-    free = jnp.where(mode == BACK, flee, drive)
-    v, v_y = jnp.where(mode == PUSH, v, free[0]), jnp.where(mode == PUSH, v_y, free[1])
     spin = jnp.where(mode == BACK, 0.0, jnp.clip(spin, -params.omega_free, params.omega_free))
-    omega = jnp.where(mode == PUSH, omega, spin)
-    v, v_y, omega = (jnp.where(done, 0.0, x) for x in (v, v_y, omega))
-    if not omni:
-        v_y = v_y + axle * omega
-    bounds = [
-        jnp.where(mode == PUSH, a, b)
-        for a, b in ((params.v_max, params.v_free), (params.omega_max, params.omega_free))
-    ]
-    twist = Twist(v, v_y, omega).saturate(*bounds)
+    free = Twist(*jnp.where(mode == BACK, flee, drive), spin), params.v_free, params.omega_free
+    push = Twist(v, v_y, omega), params.v_max, params.omega_max
+    twist, *bounds = soft.tree_where(mode == PUSH, push, free)
+    v, v_y, omega = (jnp.where(done, 0.0, x) for x in twist)
+    twist = Twist(v, v_y if omni else v_y + axle * omega, omega).saturate(*bounds)
     distance = planar.norm(jnp.stack([way_left, y]))
     details = Details(offset, distance, jnp.zeros_like(distance), face, mode != PUSH)
     memory = PoseState(
-        mode=mode,
-        leg=leg,
-        h=h,
-        known=known,
-        centred=centred,
-        p_world_contact=p_world_contact,
-        p_world_front=p_world_front,
-        p_world_base=base,
-        yaw=yaw,
-        twist=jnp.stack(twist),
-        touched=touched,
-        time=time,
-        t_lost=t_lost,
-        t_push=t_push,
-        t_even=t_even,
-        look=look,
-        looking=looking,
-        looks=looks,
-        tries=tries,
-        wider=wider,
-        side=side,
-        gear=gear,
-        done=done,
+        mode,
+        leg,
+        h,
+        known,
+        centred,
+        p_world_contact,
+        p_world_front,
+        base,
+        yaw,
+        jnp.stack(twist),
+        touched,
+        time,
+        t_lost,
+        t_push,
+        t_even,
+        look,
+        looking,
+        looks,
+        tries,
+        wider,
+        side,
+        gear,
+        done,
     )
     return memory, twist, details
 

@@ -183,15 +183,15 @@ def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Array]:
 def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Physics) -> Contact:
     """Return the contacts of the object's side with the base, at the lower and upper edge."""
     k, b = _stiffness(physics.base_solref, _D_MAX, physics.timestep)
-    c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-    z, normal, q, distance = side_contacts(body, state, m, (c, s))
-    n = (c * normal[0] - s * normal[1], s * normal[0] + c * normal[1], 0.0)
+    turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    z, normal, q, distance = side_contacts(body, state, m, turn)
+    n = *sp.turned(turn, normal), 0.0
     t = (-n[1], n[0], 0.0)
-    arm = (c * q[0] - s * q[1], s * q[0] + c * q[1])  # from the base's origin
+    arm = sp.turned(turn, q)  # from the base's origin
     lever = (state.base[0] + arm[0] - state.p[0], state.base[1] + arm[1] - state.p[1])
     r = (*lever, z - state.p[2])
     if state.driven is None:
-        v, w = (c * twist[0] - s * twist[1], s * twist[0] + c * twist[1]), twist[2]
+        v, w = sp.turned(turn, twist), twist[2]
     else:
         *v, w = state.driven.v
     of_base = (v[0] - w * arm[1], v[1] + w * arm[0], 0.0)

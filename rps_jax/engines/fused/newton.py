@@ -321,9 +321,8 @@ def wrench_on_base(
     """
     force, _ = contact_force(contact, _at(contact, x), physics)
     f_x, f_y, torque = _sums(_on_base(arm, sp.combine(force, (contact.n, contact.t, contact.s))))
-    c, s = turn
-    # Minus: the contacts' force is on the object.
-    return -(c * f_x + s * f_y), -(c * f_y - s * f_x), -torque
+    x, y = sp.turned_back(turn, (f_x, f_y))
+    return -x, -y, -torque  # the contacts' force is on the object
 
 
 def _sums(vector: Vec) -> Vec:

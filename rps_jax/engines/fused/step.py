@@ -79,8 +79,8 @@ def to_mujoco(body: Body, state: State, twist: Vec) -> Motion:
     v = sp.sub(state.v, sp.to_world(m, sp.cross(spin, com)))
     p = sp.sub(state.p, sp.to_world(m, com))
     if state.driven is None:
-        c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-        base = (c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2])
+        turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+        base = *sp.turned(turn, twist), twist[2]
         last, integral = tuple(jnp.zeros_like(x) for x in state.base), None
     else:
         base, last, integral = state.driven
@@ -135,15 +135,8 @@ def step(
     sinc = 0.5 * (1 - half * half / 6)
     q = sp.times(state.q, (1 - half * half / 2 + half**4 / 24, *sp.scale(sinc, angle)))
     length = jax.lax.rsqrt(sp.dot(q, q))
-    if driven is None:
-        c, s = turn
-        base = (
-            state.base[0] + dt * (c * twist[0] - s * twist[1]),
-            state.base[1] + dt * (s * twist[0] + c * twist[1]),
-            state.base[2] + dt * twist[2],
-        )
-    else:
-        base = sp.add(state.base, sp.scale(dt, driven.v))
+    velocity = (*sp.turned(turn, twist), twist[2]) if driven is None else driven.v
+    base = sp.add(state.base, sp.scale(dt, velocity))
     p = sp.add(state.p, sp.scale(dt, v))
     q = tuple(x * length for x in q)
     return State(base, p, q, v, w, a, alpha, driven, wrench_sum)  # type: ignore[arg-type]

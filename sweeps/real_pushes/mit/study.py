@@ -17,13 +17,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import xarray as xr
 from scipy.io import loadmat
 
-from rps_jax import InputError
+from rps_jax import InputError, fit_object
 from rps_jax.questions import Run, call_of, option
 from rps_jax.tuning import objects
 from rps_jax.tuning.objects import PRIOR, Pushes
@@ -146,7 +146,7 @@ class Mit(QuickStudy[xr.Dataset]):
         parts = {cell: partial(self._few, cell, shares) for cell in self.cells}
         results = run_parts(run, "cell", parts)
         share = xr.concat(shares.values(), xr.IndexVariable("cell", list(shares)))
-        return xr.merge([results, share[["mean", "gap_before", "gap_after"]]])
+        return xr.merge([results, share[["mean"]]])
 
     def _share(self, label: str) -> xr.Dataset:
         """Fit 20 % of the pushes of a cell with the default priors, and predict the others."""
@@ -154,19 +154,19 @@ class Mit(QuickStudy[xr.Dataset]):
         rows = np.split(_order(cell, 0), [len(cell.published) // 5])
         errors, fitted = self._predicted(cell, rows, PRIOR)
         assert fitted is not None
-        gap = objects.gaps_at_end(cell.outline, _chosen(cell.pushes, rows[0]), RADIUS)
-        gaps = {"gap_before": np.nanmedian(np.abs(gap)), "gap_after": abs(fitted.data.gap).median()}
-        return errors.assign(mean=fitted.data["mean"], **gaps)
+        return errors.assign(mean=fitted.data["mean"])
 
     def _predicted(
         self, cell: Cell, rows: Sequence[np.ndarray], prior: Mapping
-    ) -> tuple[xr.Dataset, objects.ObjectFit | None]:
+    ) -> tuple[xr.Dataset, Any]:
         """Return errors (push) after a fit to the first of two sets of rows, and any fit."""
         few, rest = rows
         chosen, fitted = _chosen(cell.pushes, few), None
         for tried in (prior, PRIOR):  # the gaps may not fit the prior of the others
             with contextlib.suppress(InputError):
-                fitted = fitted or objects.fit(cell.outline, chosen, RADIUS, tried)
+                fitted = fitted or fit_object(
+                    cell.outline, chosen, RADIUS, prior=tried, progress=False
+                )
         names = [x + y for x in ("place", "turn") for y in ("", "_ratio")]
         if fitted is None:  # refused
             return xr.Dataset({x: ("push", np.full(700, np.nan)) for x in names}), None

@@ -1,4 +1,4 @@
-"""Printer of CUDA, in which several threads of a warp compute a world.
+"""Graph and printer of CUDA, in which several threads of a warp compute a world.
 
 A node of one number is computed by all threads of a world. Of an array, thread `t` stores the
 elements `t`, `t + THREADS`, ... An array that a thread reads where another thread has written is
@@ -8,18 +8,123 @@ in shared memory.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Hashable, Iterable, Sequence
 
 import numpy as np
 
-from rps_jax.lowering.builder import INITIAL
-from rps_jax.lowering.gpu_builder import WARP, GpuBuilder
-from rps_jax.lowering.graph import Array, DynamicSlice, Gather, Input, LoopNode, Node, Result
-from rps_jax.lowering.operations import GPU_HEADER, TYPES
-from rps_jax.lowering.passes import cross_thread_arrays
-from rps_jax.lowering.simd_writer import STORED, SimdWriter
-from rps_jax.lowering.target import TooLargeError, Value
-from rps_jax.lowering.writer import Writer
+from rps_jax.lowering.builder import INITIAL, SimdBuilder
+from rps_jax.lowering.graph import (
+    Array,
+    Call,
+    DynamicSlice,
+    Gather,
+    Input,
+    LoopNode,
+    Node,
+    Params,
+    Reduce,
+    Result,
+    Shape,
+    TooLargeError,
+    Typed,
+    Value,
+    Values,
+    flat,
+    gathered_scalar,
+    size_of,
+    view_of,
+)
+from rps_jax.lowering.operations import GPU_HEADER, TYPES, defined
+from rps_jax.lowering.writer import STORED, SimdWriter, Writer
+
+WARP = 32
+_SUM = Call("add_over_threads_f")  # sum of the partial sums of all threads of a world
+
+
+class GpuBuilder(SimdBuilder):
+    """Target that builds the graph of a function for several threads per world."""
+
+    operations = defined(GPU_HEADER)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._gathers: dict[Hashable, Array] = {}
+
+    def stack(self, scalars: Values, kind: str, shape: Shape) -> Array:
+        """Gather scalars; many that the same operation computes become one array operation."""
+        scalars = tuple(map(gathered_scalar, scalars))
+        if len(scalars) <= WARP:
+            return super().stack(scalars, kind, shape)
+        return self._stacked(scalars, kind)._replace(shape=shape)
+
+    def _stacked(self, scalars: tuple[Value, ...], kind: str) -> Value:
+        """Return scalars as one operand."""
+        size = len(scalars)
+        if not any(isinstance(a, Array) for a in scalars):
+            return flat(np.asarray(scalars), size)
+        if view := view_of(scalars, (size,)):
+            return view
+        if not all(isinstance(a, Array) for a in scalars):
+            return super().stack(scalars, kind, (size,))
+        key = tuple((a.node.id, a.first) for a in scalars)
+        if key not in self._gathers:
+            self._gathers[key] = self._vectorised(scalars, kind)
+        return self._gathers[key]
+
+    def _vectorised(self, scalars: tuple[Array, ...], kind: str) -> Array:
+        """Vectorise a gather of scalars: apply their common operation to gathered operands."""
+        first, size, nodes = scalars[0].node, len(scalars), {a.node for a in scalars}
+        operations = {(node.op, len(node.operands)) for node in nodes}
+        op, are_elements = first.op, all(node.is_fusible for node in nodes)
+        if len(operations) > 1 or not are_elements or not isinstance(op, Call):
+            return super().stack(scalars, kind, (size,))
+        operands = [
+            self._stacked(
+                tuple(_operand(a, j) for a in scalars), self.kind(template.dtype, "a gather")
+            )
+            for j, template in enumerate(first.operands)
+        ]
+        return Array(self.node(op, operands, kind, size), 0, 1, (size,))
+
+    def apply(self, name: str, values: Values, params: Params, out: Typed) -> Value:
+        """Apply a primitive; sums over threads are added before they are exchanged."""
+        if name in ("add", "sub") and size_of(out.shape) == 1 and out.dtype == np.float32:
+            lhs, rhs = (_node_of(x) for x in values)
+            if lhs and rhs and rhs.op == _SUM:
+                if lhs.op == _SUM:
+                    return self._sum(name, lhs, rhs, out)
+                if lhs.op == Call(f"{name}_f"):
+                    last = _node_of(lhs.operands[1])
+                    if last and last.op == _SUM:
+                        both = self._sum("add", last, rhs, out)
+                        return super().apply(name, [lhs.operands[0], both], params, out)
+        result = super().apply(name, values, params, out)
+        node = _node_of(result)
+        if node is None or not isinstance(node.op, Reduce):
+            return result
+        op = Call(f"{node.op.binary}_over_threads_{node.kind}")
+        return Array(self.node(op, [result], node.kind, 1), 0, 1, result.shape)
+
+    def _sum(self, name: str, lhs: Node, rhs: Node, out: Typed) -> Array:
+        partial = [x.operands[0]._replace(shape=out.shape) for x in (lhs, rhs)]
+        total = super().apply(name, partial, {}, out)
+        return Array(self.node(_SUM, [flat(total, 1)], "f", 1), 0, 1, out.shape)
+
+
+def _operand(a: Array, j: int) -> Value:
+    """Return operand `j` of the operation that computed a single number."""
+    operand = a.node.operands[j]
+    if not isinstance(operand, Array):
+        return np.reshape(operand, -1)[a.first if np.size(operand) > 1 else 0]
+    return gathered_scalar(Array(operand.node, operand.first + operand.step * a.first, 1, ()))
+
+
+def _node_of(value: Value) -> Node | None:
+    """Return the node of a single number."""
+    return value.node if isinstance(value, Array) and value.node.width == 1 else None
+
+
+# --- printer -----------------------------------------------------------------------------------
 
 _MAX_SHARED = 48 * 1024  # bytes of a block
 _UNROLLED = 4  # iterations of a loop over the elements of a thread that are unrolled
@@ -45,6 +150,27 @@ extern "C" __global__ void __launch_bounds__(32) step(const __grid_constant__ Ar
 _FOLDS = "\n".join(
     f"FOLD({name}, {kind}, {TYPES[kind]})" for name, kind in INITIAL if (name, kind) != ("add", "f")
 )
+
+
+def cross_thread_arrays(nodes: Iterable[Node], results: Iterable[Result]) -> set[Node]:
+    """Return the arrays of which a thread reads elements that another thread computes."""
+    reads: list[tuple[Sequence[Value], int]] = [([x.value], x.size) for x in results]
+    waiting = list(nodes)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, LoopNode):
+            waiting += node.body
+            values = zip(node.operands, node.results, strict=True)
+            reads += zip(values, [x.size for x in node.carried], strict=True)
+            reads.append(([node.condition], 1))
+        else:
+            size = 0 if isinstance(node.op, Gather | DynamicSlice) else node.size
+            reads.append((node.operands, size))
+    shared: set[Node] = set()
+    for values, size in reads:
+        arrays = (a for a in values if isinstance(a, Array) and a.node.width > 1)
+        shared |= {a.node.storage for a in arrays if not a.covers(size)}
+    return shared
 
 
 class GpuWriter(SimdWriter):

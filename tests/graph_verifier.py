@@ -1,15 +1,17 @@
-"""Rules of the graph, their check, and its text.
+"""Rules of the graph of `rps_jax.lowering`, their check, and its text.
 
-Tests set `enabled`; then each graph is checked when it is built and after each pass.
+After `install`, each graph is checked when it is built, and after the pass of scalar code.
 """
 
 from __future__ import annotations
 
+import functools
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
+from rps_jax.lowering import scalar, writer
 from rps_jax.lowering.graph import (
     Array,
     Call,
@@ -23,13 +25,13 @@ from rps_jax.lowering.graph import (
     Node,
     Reduce,
     Result,
+    Value,
     is_unchanged,
+    kind_of,
     live_nodes,
     nodes_of,
 )
-from rps_jax.lowering.target import Value, kind_of
 
-enabled = False
 _COMPARISON = re.compile(r"(lt|le|eq|gt|ge|ne|lt_to)_\w")
 
 
@@ -37,17 +39,40 @@ class GraphError(Exception):
     """A graph that breaks a rule: a fault of a builder or of a pass."""
 
 
+def install() -> None:
+    """Check each graph that is built in this process."""
+    for module in (writer, scalar):
+        module.results = _checked(module.results, lambda built: check(built[0]))
+    scalar.sink_products = _checked(scalar.sink_products, lambda nodes: check_nodes(nodes))
+
+
+def _checked(function: Callable, check_result: Callable) -> Callable:
+    """Return a function whose result is checked."""
+
+    @functools.wraps(function)
+    def call(*arguments):
+        result = function(*arguments)
+        check_result(result)
+        return result
+
+    return call
+
+
 def check(results: Sequence[Result]) -> None:
-    """Check the graph of results, if tests enable it.
+    """Check the graph of results.
 
     Raises:
       GraphError: a node has operands of a wrong number, kind or size, an operand that is not
         computed before it, or no reader.
     """
-    if enabled:
-        _check_region(live_nodes(nodes_of(result.value for result in results)), set())
-        for position, value, size, kind in results:
-            _check_value(value, size, kind, f"result {position}")
+    check_nodes(live_nodes(nodes_of(result.value for result in results)))
+    for position, value, size, kind in results:
+        _check_value(value, size, kind, f"result {position}")
+
+
+def check_nodes(nodes: Iterable[Node]) -> None:
+    """Check the nodes of a graph."""
+    _check_region(nodes, set())
 
 
 def signature(function: str) -> tuple[str, str]:

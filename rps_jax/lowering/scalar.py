@@ -1,28 +1,174 @@
-"""Printer of a graph of arrays as scalar code, the base of the printers of C and JavaScript."""
+"""Graph and printer of scalar code, the base of C and JavaScript.
+
+The graph leaves the precision to the printed code. A product with a large constant matrix is one
+node.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Collection, Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
 
-from rps_jax.lowering import verifier
-from rps_jax.lowering.builder import results
+from rps_jax.lowering.builder import Factor, GraphBuilder, results
 from rps_jax.lowering.graph import (
+    Array,
     Call,
+    Carried,
     DynamicSlice,
     If,
     Input,
     LoopNode,
+    LoopResult,
     MatrixProduct,
     Node,
     Reduce,
+    Target,
+    Value,
+    flat,
+    gathered_scalar,
+    is_constant,
+    key_of,
+    live_nodes,
+    nodes_of,
 )
-from rps_jax.lowering.passes import sink_products
 from rps_jax.lowering.routine import Routine
-from rps_jax.lowering.scalar_builder import ScalarBuilder
 from rps_jax.lowering.writer import Writer
+
+_LARGE = 256  # weights of a matrix from which on a product is a loop over its rows
+
+
+class ScalarBuilder(GraphBuilder):
+    """Target that builds the graph of a function for one thread, in float or double."""
+
+    kinds = "fib"
+    max_products = 100_000
+
+    def __init__(self, operations: Collection[str]) -> None:
+        """Build a graph of the `operations` that the language spells."""
+        super().__init__()
+        self.operations = frozenset(operations)
+
+    def scalar(self, value: Value, index: int) -> Value:
+        """Return one number of a value, from where it was gathered."""
+        scalar = super().scalar(value, index)
+        while (source := gathered_scalar(scalar)) is not scalar:
+            scalar = source
+        return scalar
+
+    # The printed code may have a deadline, so the length of each loop must be known.
+    while_loop = Target.while_loop
+
+    def products(self, matrix: Factor, rows: Factor, dtype: np.dtype) -> list[Value]:
+        (weights, indices), (value, row_indices) = matrix, rows
+        is_large = is_constant(weights) and len(indices) == 1 and indices.size >= _LARGE
+        if not is_large or dtype.kind != "f":
+            return super().products(matrix, rows, dtype)
+        columns = np.reshape(weights, -1)[indices[0]].T
+        return [self._times_matrix(self._rows(value, row_indices[0]), columns)]
+
+    def _rows(self, value: Value, indices: np.ndarray) -> list[list[Value]]:
+        return [[self.scalar(value, int(i)) for i in row] for row in indices]
+
+    def _times_matrix(self, rows: list[list[Value]], matrix: np.ndarray) -> Value:
+        """Multiply rows with a constant matrix, in one loop over the matrix.
+
+        Networks with a mirror symmetry have pairs of rows (a, b), (b, a). Sum and difference halve
+        their arithmetic: (a + b) (P + Q) / 2 plus or minus (a - b) (P - Q) / 2 of the halves P, Q.
+        """
+        matrix = np.ascontiguousarray(matrix, float)
+        columns, (half, odd) = matrix.shape[1], divmod(matrix.shape[0], 2)
+        keys = [list(map(key_of, row)) for row in rows]
+        if len(rows) == 2 and not odd and keys[0] == keys[1][half:] + keys[1][:half]:
+            template, indices = np.empty(half), np.arange(half)
+            pair = [self.gather(x, indices, template) for x in (rows[0][:half], rows[0][half:])]
+            p, q = matrix.reshape(2, half, columns) / 2
+            products = []
+            for name, part in (("add", p + q), ("sub", p - q)):
+                row = self._rows(self.apply(name, pair, {}, template), indices[None])
+                products.append(self._times_matrix(row, part))
+            halves = [self.apply(x, products, {}, np.empty(columns)) for x in ("add", "sub")]
+            return self.gather(halves, np.arange(2 * columns), np.empty(0))
+        op = MatrixProduct(matrix.shape, matrix.tobytes())
+        node = self.node(op, list(itertools.chain(*rows)), "f", len(rows) * columns)
+        return Array(node, 0, 1, (node.size,))
+
+
+# --- blocks ------------------------------------------------------------------------------------
+
+
+def sink_products(roots: Sequence[Node]) -> list[Node]:
+    """Return all live nodes, with a block for products that are not always used.
+
+    A network is then evaluated only in the steps that use its result.
+    """
+    nodes = live_nodes(roots)
+    if any(isinstance(node.op, MatrixProduct) for node in nodes):
+        conditions = dict.fromkeys(filter(None, map(_condition, nodes)))
+        for condition, side in itertools.product(conditions, (1, 2)):
+            if _move_into_block(nodes, roots, condition, side):
+                return live_nodes(roots)
+    return nodes
+
+
+def _condition(node: Node) -> tuple[Node, int] | None:
+    """Return the node and the index of the number by which a node chooses an operand."""
+    is_choice = isinstance(node.op, Call) and node.op.function.startswith("choose_")
+    a = node.operands[0] if is_choice else None
+    return (a.node, a.first) if isinstance(a, Array) and (not a.step or node.size == 1) else None
+
+
+def _move_into_block(
+    nodes: Sequence[Node], roots: Sequence[Node], condition: tuple[Node, int], side: int
+) -> bool:
+    """Move nodes that matter on one side of a condition into a block, if a product is there."""
+    always: set[Node] = set()
+    waiting = list(roots)
+    while waiting:
+        node = waiting.pop()
+        if node not in always:
+            always.add(node)
+            is_choice = _condition(node) == condition
+            operands = [node.operands[i] for i in (0, 3 - side)] if is_choice else node.operands
+            waiting += nodes_of(operands) + list(node.captured)
+    block = [node for node in nodes if node not in always and not isinstance(node.op, Input)]
+    inside = set(block)
+    if not any(isinstance(node.op, MatrixProduct) for node in block):
+        return False
+    choices = [
+        node
+        for node in nodes
+        if node in always and _condition(node) == condition
+        if not inside.isdisjoint(nodes_of([node.operands[side]]))
+    ]
+    starts = tuple(node.operands[3 - side] for node in choices)
+    captured = {x for node in block for x in node.predecessors} - inside
+    captured |= {condition[0], *nodes_of(starts)}
+    if not set(live_nodes(captured)).isdisjoint(choices):
+        return False
+    ids = itertools.count(max(node.id for node in nodes) + 1)
+    carried = tuple(Node(next(ids), Carried(), (), n.kind, n.size) for n in choices)
+    loop = LoopNode(
+        next(ids),
+        If(side == 1),
+        starts,
+        kind="f",
+        size=0,
+        captured=tuple(captured),
+        carried=carried,
+        results=tuple(flat(node.operands[side], node.size) for node in choices),
+        condition=Array(*condition, 1, (1,)),
+        body=tuple(block),
+    )
+    for node, carry in zip(choices, carried, strict=True):
+        node.op, node.operands, node.captured = LoopResult(carry), (), (loop,)
+        node.__dict__.pop("fusion_barriers", None)
+    return True
+
+
+# --- printer -----------------------------------------------------------------------------------
 
 _UNROLLED = 4  # elements of an array that is printed without a loop, at most
 # Rows of a matrix that one iteration multiplies. Compilers vectorise the loop over the columns, and
@@ -61,7 +207,6 @@ class ScalarWriter(Writer):
             routine.jaxpr, [x.type for _, x in fields], [x.type for _, x in outputs], target
         )
         nodes = sink_products(roots)
-        verifier.check(values)
         self.body = self.lines(nodes, roots)
         known = {result.position: result.value for result in values}
         # Group, field and value of each result.
