@@ -348,9 +348,9 @@ RECIPES: dict[str, Recipe] = {
     "plans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "gradients_mjx": recipe(f"rps sweeps/gradients/mjx.py {_MACHINE}", cores=6),
-    **dict.fromkeys(
-        ("gradients_stiff", "gradients_iterations"),
-        recipe(f"rps sweeps/gradients/stiff.py {_MACHINE}", cores=3),
+    "gradients_stiff": recipe(f"rps sweeps/gradients/stiff.py {_MACHINE}", cores=3),
+    "gradients_direction": recipe(
+        f"rps sweeps/gradients/direction.py --counts 6 64 2048 --truth 4096 {_MACHINE}", cores=15
     ),
     "gradients_race": recipe(f"rps sweeps/gradients/race.py --wall 10 30 {_MACHINE}", cores=200),
     "gradients_race_18": recipe(
