@@ -278,7 +278,9 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             ],
             **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
         }
-        variables = {name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()}
+        variables: dict[str, Any] = {
+            name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()
+        }
         for name in SCORES:
             first, *tuned = scores[name].values.astype(np.float32)
             by_budget = np.array(tuned)[inverse.ravel()].reshape(*shape, len(budgets), -1)

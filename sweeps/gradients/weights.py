@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -35,14 +35,14 @@ def changes_of(path: Path) -> dict[str, np.ndarray]:
     return {name: weights[name] - x for name, x in _POLICY.weights.items()}
 
 
-def step(params: Weights, state: Any, obs: Any) -> Any:
+def step(params: Any, state: Any, obs: Any) -> Any:
     """Run the learned law with changed weights."""
     weights = jax.tree.map(lambda x, change: x + change, _POLICY.weights, params.weights)
     return network.step(_POLICY.network, weights, params, state, obs)
 
 
 LAW = Law(
-    partial(network.init, _POLICY.network),
+    cast(Any, partial(network.init, _POLICY.network)),
     step,
     "taxels",
     bounds={f"weights.{name}": Bound(-_CHANGE, _CHANGE) for name in _POLICY.weights},
