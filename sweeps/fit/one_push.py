@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar
 
@@ -22,7 +22,6 @@ from rps_jax import Setting
 from rps_jax.laws import resolve_law
 from rps_jax.questions import Run, call_of, option
 from rps_jax.runs.question import SimulationQuestion
-from rps_jax.trials.setting import seed_of
 from rps_jax.tuning.fit import Bank
 from rps_jax.world import points
 from rps_jax.world.domain import quantities_of
@@ -80,7 +79,7 @@ class OnePush(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     def _problems(self) -> list[tuple[np.ndarray, Replay, Replay]]:
         """True point (q,), and the least-squares problem of each of two pushes, by object."""
         domain, interval = self._bank.domain, self._bank.interval
-        seed, index = seed_of(self.setting.seed, "test"), np.arange(self.objects)
+        seed, index = replace(self.setting, split="test").world_seed, np.arange(self.objects)
         first, other = np.split(points.points_of(domain, np.arange(2 * self.objects), seed), 2)
         task = [name in (*quantities_of("task"), *_KEYS) for name in points.names(domain)]
         pairs = []

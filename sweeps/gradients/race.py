@@ -27,7 +27,6 @@ import xarray as xr
 from rps_jax import RPSParams, Rules, Setting, errors, evaluate
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.control import registry
-from rps_jax.control.base import entries
 from rps_jax.laws import resolve_law
 from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.runs.evaluate import score_candidates
@@ -35,20 +34,16 @@ from rps_jax.runs.question import SimulationQuestion
 from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
-from rps_jax.tuning.learn import Learn
 from rps_jax.tuning.run import Tuning
-from sweeps.gradients.weights import changes_of
 from sweeps.study_base import Parts, Study, Table, part_name
 
 FOLDER, DRUMS = "sweeps/gradients", ("random_cylinder",)  # from the root of the repository
-# Options of tunings by the number of tuned parameters: those of RPS or RPS+, the entries of tables,
-# or the weights of a learned law.
+# Options of tunings by the number of tuned parameters: those of RPS or RPS+, or entries of tables.
 COUNTS: dict[int, dict[str, Any]] = {
     6: {"tuned": ("K_h", "K_v", "L", "beta", "l_cr", "d_th")},
     13: {"tuned": ("full",)},
     18: {"law": "rps_plus", "domain": ("hostile",), "robot": "kairos", "objects": ("random_box",)},
     **{n: {"law": f"{FOLDER}/tables.py:Table{n}", "objects": DRUMS} for n in (64, 512, 2048)},
-    16515: {"law": f"{FOLDER}/weights.py:Weights", "domain": ("hostile",), "objects": DRUMS},
 }
 SCORES = "success", "score"  # of a trial in a test world
 FIRST = "derivatives"  # method with which the others are compared
@@ -151,19 +146,10 @@ def timed(limit: float) -> type[Run]:
     return Timed
 
 
-METHODS: dict[str, tuple[type[Any], dict[str, Any]]] = {
+METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
     "derivatives": (PacedGrad, {"steps": 16}),
     "slopes": (_ES, {"estimator": "antithetic", "worlds": 128, "generations": 10}),
     "evolution": (_ES, {"worlds": 32, "population": 16, "generations": 1000}),
-    # As `learned_small` was learned, for one shape in one domain.
-    "PPO": (
-        Learn,
-        {
-            **{"network": "mlp", "initial": "learned_small", "action_std": 0.2},
-            **{"learning_rate": 2e-4, "prioritised": 0.5, "anneal": 0.4, "ema_updates": 100},
-            **{"num_envs": 64, "drawn": 1024, "minutes": 0.0, "success": 2.0, "failure": 1.0},
-        },
-    ),
 }
 
 
@@ -192,11 +178,10 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     REPORTS_TIMES: ClassVar[bool] = True
 
     methods: tuple[str, ...] = (FIRST, "slopes", "evolution")
-    """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials), evolution, or PPO
-    for the weights of a learned law, up to the largest budget of simulated time."""
+    """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials), or evolution."""
     counts: tuple[int, ...] = (6, 13, 64, 512, 2048)
-    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, 64, 512 and 2048
-    entries of tables, or 16515 weights of a learned law."""
+    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, or 64, 512 and
+    2048 entries of tables."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
     simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
@@ -224,14 +209,10 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             n: partial(self._compete, run.folder or Path(str(self.out)), n) for n in self.counts
         }
 
-    def tuning(self, seed: int, count: int, method: str) -> Tuning | Learn:
+    def tuning(self, seed: int, count: int, method: str) -> Tuning:
         """Return a tuning of the race."""
         kind, options = METHODS[method]
         setting, budget = replace(self.setting, seed=seed), max(self.simulated, default=0.0)
-        if kind is Learn:
-            _, domain = problem(count)
-            update = options["num_envs"] * Learn.num_steps * Learn.hold  # [s] of simulated time
-            return Learn((domain,), updates=round(budget / update), **options, setting=setting)
         diagonal = {"estimator": "sep_cma"} if method == "evolution" and count >= _LARGE else {}
         sizes = _QUICK if self.quick else {}
         limits = {"validation": 64, "budget": budget}
@@ -242,14 +223,11 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         labels = list(itertools.product(self.seeds, (count,), self.methods))
         folders = [folder / part_name(*label) for label in labels]
         questions = [self.tuning(*label) for label in labels]
-        pool = Lockstep(sum(isinstance(x, Tuning) for x in questions))
+        pool = Lockstep(len(labels))
         limited = timed(np.inf if self.simulated else max(self.wall))
 
-        def run(question: Tuning | Learn, at: Path) -> pd.DataFrame:
+        def run(question: Tuning, at: Path) -> pd.DataFrame:
             at.mkdir(exist_ok=True)
-            if isinstance(question, Learn):
-                question.answer(Run(at, no_progress))
-                return learned_curve(at)
             try:
                 object.__setattr__(question, "pool", pool)
                 question.answer(limited(at, no_progress))
@@ -347,20 +325,6 @@ def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
     """Return the generation with the best validation within a budget."""
     within = curve[spent(curve, budget) <= amount]
     return within.iloc[int(np.nanargmin(within.validation))]
-
-
-def learned_curve(folder: Path) -> pd.DataFrame:
-    """Return the start and the end of PPO as two generations of a tuning of the weights."""
-    curve, changes = pd.read_csv(folder / "curve.csv"), changes_of(folder / "policy.npz")
-    names = registry.named_leaves({"params": {"weights": changes}})
-    ends = [{name: np.zeros_like(x) for name, x in names.items()}, names]
-    rows = [
-        {label: x[at] for name, x in leaves.items() for label, at in entries(name, x)}
-        for leaves in ends
-    ]
-    last = curve.iloc[-1]
-    spent = {"run": [last.time - curve.time[0], 0.0], "simulated": [last.simulated, 0.0]}
-    return pd.DataFrame(rows).assign(**spent, validation=[1.0, 0.0])
 
 
 def problem(count: int) -> tuple[Any, str]:
