@@ -20,7 +20,7 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.laws import LawParams, law_of, resolve_law
 from rps_jax.physics import FRICTION, PHYSICS
 from rps_jax.questions import Run
-from rps_jax.trials.batch_run import outcomes
+from rps_jax.trials.batch import outcomes
 from rps_jax.trials.progress import Progress, SequentialProgress
 from rps_jax.trials.pushes import Cases
 from rps_jax.trials.results import outcome_dataset

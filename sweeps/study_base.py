@@ -33,7 +33,7 @@ from rps_jax.record import options, provenance
 from rps_jax.runs import execution
 from rps_jax.runs.question import Question, QuickQuestion, TrialQuestion
 from rps_jax.runs.results import PlanRequest, Results
-from rps_jax.trials.batch_run import run_batch
+from rps_jax.trials.batch import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.trials.trial import Outcome
 from rps_jax.worlds import DomainLike, parse_domain

@@ -37,7 +37,7 @@ from rps_jax.trials import trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules, Trial
-from rps_jax.world import domain, objects, streams, tasks
+from rps_jax.world import domain, objects, quantity, tasks
 from rps_jax.world.domain import Range, parse_domain
 from rps_jax.world.physics import preset
 
@@ -218,7 +218,7 @@ def temporary_names() -> Iterator[None]:
         tasks.UNRANGED,
         tasks.OUTCOMES,
         tasks.FAILURES,
-        streams._OWNERS,
+        quantity._OWNERS,
         engines._REGISTERED,
     )
     saved: list[Any] = [table.copy() for table in tables]

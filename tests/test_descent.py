@@ -20,12 +20,11 @@ from rps_jax.control.observation import Twist
 from rps_jax.errors import InputError
 from rps_jax.runs.evaluate import CandidateScores, evaluate
 from rps_jax.trials import trial
-from rps_jax.trials.jobs import rows
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trajectory import control_loop, draw_worlds
 from rps_jax.trials.trial import Rules
-from rps_jax.trials.worlds import soften_skins
+from rps_jax.trials.worlds import rows, soften_skins
 from rps_jax.tuning import derivatives, descent, optimisers
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES

@@ -19,8 +19,8 @@ from rps_jax.control.base import Law
 from rps_jax.control.laws import unicycle
 from rps_jax.control.observation import Details, Twist
 from rps_jax.record import files
-from rps_jax.robot import drive
-from rps_jax.robot.drive import Tyres
+from rps_jax.robot import base as robot_base
+from rps_jax.robot.base import Tyres
 from rps_jax.robot.robot import ROBOTS, Robot, parse_robot
 from rps_jax.robot.skin import NONE
 from rps_jax.runs.sweep import Sweep
@@ -117,9 +117,9 @@ TWIST = jnp.array([0.4, 0.3, -1.0])
 
 
 def test_the_twist_of_an_axle_keeps_speed_and_turn():
-    aim = drive.aim(DIFFERENTIAL, jnp.zeros(3), TWIST, PERIOD)
+    aim = robot_base.aim(DIFFERENTIAL, jnp.zeros(3), TWIST, PERIOD)
     np.testing.assert_allclose(aim, [0.4, -0.2, -1.0], rtol=1e-6)
-    aim = drive.aim(CAR, jnp.zeros(3), TWIST, PERIOD)
+    aim = robot_base.aim(CAR, jnp.zeros(3), TWIST, PERIOD)
     np.testing.assert_allclose(aim, [0.4, -0.24, -0.8], rtol=1e-6)
 
 
@@ -137,26 +137,26 @@ LIMITS = {
 def test_a_limit_keeps_the_curvature(name):
     limits, share = LIMITS[name]
     robot = replace(DIFFERENTIAL, **limits)
-    aim = jax.jit(drive.aim, static_argnums=3)(robot, jnp.zeros(3), TWIST, PERIOD)
+    aim = jax.jit(robot_base.aim, static_argnums=3)(robot, jnp.zeros(3), TWIST, PERIOD)
     np.testing.assert_allclose(aim, share * np.array([0.4, -0.2, -1.0]), rtol=1e-5)
 
 
 def test_errors_and_slip_are_those_of_wheels():
     twist = jnp.array([0.4, -0.2, -1.0])
-    wrong = drive.apply_errors(DIFFERENTIAL, twist, jnp.array([0.1, 0.5, -0.1]))
+    wrong = robot_base.apply_errors(DIFFERENTIAL, twist, jnp.array([0.1, 0.5, -0.1]))
     # The left wheel has 0.65 m/s, the right one 0.15 m/s.
     left, right = 0.65 * 1.1, 0.15 * 0.9
     omega = (right - left) / 0.5
     np.testing.assert_allclose(wrong, [(left + right) / 2, 0.2 * omega, omega], rtol=1e-5)
-    np.testing.assert_allclose(drive.apply_errors(None, twist, jnp.zeros(3)), twist)
-    slips = drive.apply_slip(replace(DIFFERENTIAL, slip=0.1, slip_yaw=0.4), twist)
+    np.testing.assert_allclose(robot_base.apply_errors(None, twist, jnp.zeros(3)), twist)
+    slips = robot_base.apply_slip(replace(DIFFERENTIAL, slip=0.1, slip_yaw=0.4), twist)
     np.testing.assert_allclose(slips, [0.36, -0.12, -0.6], rtol=1e-6)
 
 
 def test_the_motor_does_not_resist_a_sideways_velocity_and_the_tyres_stop_it():
     robot = replace(DIFFERENTIAL, force_max=300.0)
     still, turn = (0.0, 0.0, 0.0), (1.0, 0.0)
-    force, _ = drive.push(robot, still, still, (0.0, 0.05, 0.0), turn, 0.01)
+    force, _ = robot_base.push(robot, still, still, (0.0, 0.05, 0.0), turn, 0.01)
     assert force == (0.0, 0.0, 0.0)
     tyres = Tyres.of(robot, (0.0, 0.05, 0.0), turn, 0.01)
     inertia = np.diag([robot.mass, robot.mass, robot.inertia])

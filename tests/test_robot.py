@@ -29,7 +29,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import Law
 from rps_jax.control.observation import Details, Twist
 from rps_jax.geometry.solid import GRAVITY
-from rps_jax.robot import drive
+from rps_jax.robot import base as robot_base
 from rps_jax.robot.robot import ROBOTS, Robot, parse_robot
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
@@ -51,7 +51,7 @@ def reference_velocities(robot, twist, steps):
     """Return reference velocities (steps, 3) of the drive of a base at rest, at one twist."""
     aim, velocities = jnp.zeros(3), []
     for _ in range(steps):
-        aim = drive.aim(robot, aim, jnp.asarray(twist, float), PERIOD)
+        aim = robot_base.aim(robot, aim, jnp.asarray(twist, float), PERIOD)
         velocities.append(np.asarray(aim))
     return np.array(velocities)
 
@@ -99,14 +99,14 @@ def test_wheels_that_slip_lose_their_share_of_each_axis(name):
     robot, shares = SLIPS[name]
     assert not robot.ideal
     expected = TWIST * (1 - np.array(shares))
-    assert_allclose(drive.apply_slip(robot, TWIST), expected, rtol=1e-6)
+    assert_allclose(robot_base.apply_slip(robot, TWIST), expected, rtol=1e-6)
 
 
 def test_slip_alone_is_that_of_all_axes_and_none_costs_nothing():
-    assert drive.apply_slip(Robot(lag=0.1), TWIST) is TWIST
+    assert robot_base.apply_slip(Robot(lag=0.1), TWIST) is TWIST
     for share in (0.1, 0.45):
         robots = Robot(slip=share), Robot(slip=share, slip_sideways=share, slip_yaw=share)
-        same(*(jax.jit(drive.apply_slip)(robot, TWIST) for robot in robots))
+        same(*(jax.jit(robot_base.apply_slip)(robot, TWIST) for robot in robots))
 
 
 class Steady(NamedTuple):
@@ -177,7 +177,7 @@ def test_the_environment_and_a_single_trial_turn_by_the_share_that_is_left():
 
 def test_a_base_with_slip_stalls_at_its_own_speed():
     """A base with 90 % slip that aims at 50 mm/s executes 5 mm/s."""
-    state = drive.init_drive(TWIST)._replace(aim=jnp.array(AHEAD))
+    state = robot_base.init_drive(TWIST)._replace(aim=jnp.array(AHEAD))
     for robot, speed, stands in (
         (Robot(slip=0.9), 0.005 * 0.99, 0),
         (Robot(slip=0.9), 0.0004, 1),
@@ -185,7 +185,7 @@ def test_a_base_with_slip_stalls_at_its_own_speed():
         (Robot(), 0.0051, 0),
     ):
         qvel = jnp.zeros(9).at[0].set(speed)
-        assert int(drive.count_stalled_steps(robot, state, qvel).stalled) == stands
+        assert int(robot_base.count_stalled_steps(robot, state, qvel).stalled) == stands
 
 
 # --- the drive -----------------------------------------------------------------------------
@@ -199,7 +199,7 @@ def test_the_force_is_bounded_in_its_direction_by_drive_traction_and_rolling():
     assert replace(robot, torque_max=7.0).turn_max == 7.0
     still = (0.0, 0.0, 0.0)
     for turn in ((1.0, 0.0), (0.6, 0.8)):
-        force, _ = drive.push(robot, still, (3.0, 4.0, 5.0), still, turn, 0.01, np)
+        force, _ = robot_base.push(robot, still, (3.0, 4.0, 5.0), still, turn, 0.01, np)
         assert np.hypot(*force[:2]) == pytest.approx(robot.push_max)
         c, s = turn
         along = (c * force[0] + s * force[1], c * force[1] - s * force[0])
@@ -213,13 +213,13 @@ def test_the_servo_overshoots_once_and_recovers_from_a_stall():
     v, integral = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     velocities = []
     for _ in range(100):
-        force, integral = drive.push(robot, integral, AHEAD, v, (1.0, 0.0), dt, np)
+        force, integral = robot_base.push(robot, integral, AHEAD, v, (1.0, 0.0), dt, np)
         v = (v[0] + dt * force[0] / 100, 0.0, 0.0)
         velocities.append(v[0])
     assert velocities[-1] == pytest.approx(0.05, rel=1e-4)
     assert max(velocities) == pytest.approx(0.05 * (1 + np.exp(-2)), rel=0.04)
     for _ in range(500):  # held by a wall
-        force, integral = drive.push(robot, integral, AHEAD, (0.0,) * 3, (1.0, 0.0), dt, np)
+        force, integral = robot_base.push(robot, integral, AHEAD, (0.0,) * 3, (1.0, 0.0), dt, np)
     assert force[0] == pytest.approx(200.0)
     assert abs(integral[0]) < 2 * 200.0
 

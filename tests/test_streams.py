@@ -9,7 +9,7 @@ import pytest
 import rps_jax
 from rps_jax import Domain, InputError, Quantity, Range, engines, register_quantity, register_task
 from rps_jax.engines.quasistatic import QuasistaticEngine
-from rps_jax.world import domain, draws, points, streams, tasks
+from rps_jax.world import domain, draws, points, quantity, tasks
 from rps_jax.world.tasks.base import Task
 from rps_jax.world.tasks.path import LOOKAHEAD
 from rps_jax.world.tasks.path import Path as PathTask
@@ -55,10 +55,10 @@ def test_a_new_quantity_is_drawn_independently_of_every_other(registries):
 @pytest.mark.parametrize("name", ["mass", "threshold"])
 def test_a_number_depends_on_seed_index_and_name_alone(name):
     index = np.array([7, 0, 123_456, 8])
-    numbers = streams.stream(3, name, index)
+    numbers = quantity.stream(3, name, index)
     for i, value in zip(index, numbers, strict=True):
-        assert streams.stream(np.int64(3), name, np.array([i]))[0] == value
-    assert (streams.stream(4, name, index) != numbers).all()
+        assert quantity.stream(np.int64(3), name, np.array([i]))[0] == value
+    assert (quantity.stream(4, name, index) != numbers).all()
 
 
 def test_the_numbers_of_names_are_frozen():
@@ -68,9 +68,9 @@ def test_the_numbers_of_names_are_frozen():
         "mass": [0.7337459554446363, 0.23977256769716782, 0.9783784981101183],
         "threshold": [0.056742026178911664, 0.7637135980157267, 0.07944936203022857],
     }
-    assert set(streams.COLUMNS.values()) == set(range(64))
+    assert set(quantity.COLUMNS.values()) == set(range(64))
     for name, values in expected.items():
-        np.testing.assert_array_equal(streams.stream(5, name, index), values, name)
+        np.testing.assert_array_equal(quantity.stream(5, name, index), values, name)
 
 
 def test_a_quantity_of_another_owner_says_what_it_sets(registries):

@@ -45,9 +45,8 @@ from rps_jax.runs import execution, sweep
 from rps_jax.runs.plan import Shard, load_plan, open_run
 from rps_jax.runs.sweep import merge
 from rps_jax.trials import batch, trial
-from rps_jax.trials.jobs import Job
 from rps_jax.trials.trial import Rules
-from rps_jax.trials.worlds import drawn_worlds
+from rps_jax.trials.worlds import Job, drawn_worlds
 from rps_jax.world import domain, draws
 from rps_jax.world.domain import LABELS, QUANTITIES, Range
 

@@ -30,7 +30,7 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.collection import ease
 from rps_jax.tuning.evolution import TuneES
-from rps_jax.world import draws, points, streams, tasks
+from rps_jax.world import draws, points, quantity, tasks
 from rps_jax.world.domain import DOMAINS, from_json, parse_domain, to_json
 from rps_jax.world.tasks.base import CourseInputs, Positions, Task
 from rps_jax.world.tasks.path import Path, PathCourse
@@ -97,7 +97,7 @@ def test_the_example_of_a_task_is_complete(registries, monkeypatch):
     monkeypatch.setitem(sys.modules, "band", band)  # whose annotations are evaluated
     exec(page.partition("```python\n")[2].partition("```")[0], vars(band))
     task: Task = tasks.TASKS["band"](half_width=0.2)  # pyright: ignore[reportCallIssue]
-    targets = 1 + streams.random_numbers(0, np.arange(2))[:, :2]
+    targets = 1 + quantity.random_numbers(0, np.arange(2))[:, :2]
     goals, course = task.courses(CourseInputs({}, targets, np.full(2, 0.36)))
     world = jax.tree.map(lambda x: jnp.asarray(x[0]), course)
     off, point = jnp.zeros(2), jnp.array([1.0, 0.0])

@@ -25,10 +25,10 @@ from rps_jax.runs.plan import Plan, build_batch, scene_of
 from rps_jax.runs.push import find_differences, program_slots, select_law
 from rps_jax.runs.question import Command, call_of
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
+from rps_jax.trials.worlds import WorldBatch, rows
 from rps_jax.world import video
 from rps_jax.world.scene import Scene
 from rps_jax.world.video import Shot, Tile

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from rps_jax.control.observation import Details, Twist
-from rps_jax.geometry.arrays import Parameter
+from rps_jax.geometry.arrays import Parameter, Pytree
 from rps_jax.robot.base import LoadCell
 from rps_jax.robot.robot import DriveKind
 from rps_jax.spec import Bound as Bound
@@ -91,20 +91,20 @@ def entries(name: str, leaf: Leaf) -> list[tuple[str, tuple[int, ...]]]:
 class StaticLeaf:
     """Function in parameters, as an activation of a module; it is part of the program."""
 
-    value: Any
+    value: object
 
 
-def freeze_functions(tree: Any) -> Any:
+def freeze_functions(tree: Pytree) -> Pytree:
     """Replace functions in a pytree by static leaves, so that all of its leaves are numbers."""
     return jax.tree.map(lambda x: StaticLeaf(x) if callable(x) else x, tree)
 
 
-def thawing(function: Callable[..., Any]) -> Callable[..., Any]:
+def thawing(function: Callable[..., Pytree]) -> Callable[..., Pytree]:
     """Return a function that restores the functions in its first argument."""
     is_static = lambda x: isinstance(x, StaticLeaf)  # noqa: E731
 
     @functools.wraps(function)
-    def call(tree: Any, *arguments: Any, **options: Any) -> Any:
+    def call(tree: Pytree, *arguments: Pytree, **options: Pytree) -> Pytree:
         tree = jax.tree.map(lambda x: x.value if is_static(x) else x, tree, is_leaf=is_static)
         return function(tree, *arguments, **options)
 

@@ -87,7 +87,7 @@ def leaves_to_json(tree: object) -> JsonObject:
     return {name: np.asarray(leaf, float).tolist() for name, leaf in named_leaves(tree).items()}
 
 
-def replace_leaves(tree: T, changes: Mapping[str, Any]) -> T:
+def replace_leaves(tree: T, changes: Mapping[str, object]) -> T:
     """Replace leaves of parameters, or of any pytree, by their paths (see `named_leaves`)."""
     leaves = named_leaves(tree)
     for name in changes:
@@ -270,7 +270,7 @@ def parse_law(text: str) -> tuple[str, LawParams]:
     return label, changed
 
 
-def _parse_leaf(field: str, value: Any, shape: tuple[int, ...]) -> Any:
+def _parse_leaf(field: str, value: object, shape: tuple[int, ...]) -> object:
     """Return a number, or an array of this shape of nested lists, or raise InputError."""
     if not shape:
         return errors.check_number(field, value)

@@ -30,6 +30,7 @@ from rps_jax.control.observation import (
     Twist,
 )
 from rps_jax.errors import InputError, not_allowed
+from rps_jax.geometry.arrays import Pytree
 
 Function = Callable[..., object]
 _PACKAGE = str(Path(__file__).resolve().parent.parent)
@@ -103,7 +104,7 @@ def _check_traced(
     init: Function,
     step: Function,
     senses: Senses,
-    tree: Any,
+    tree: Pytree,
     shapes: Sequence[tuple[int, ...]],
     taxels: int,
     heading: bool,
@@ -114,7 +115,7 @@ def _check_traced(
     state = _trace("init", init, params)
     name = "step" if taxels == _TAXELS else f"step, for a robot with {taxels} taxels,"
     observation = observation_shapes(senses, taxels, heading)
-    results: Any = _trace(name, step, params, state, observation)
+    results: Pytree = _trace(name, step, params, state, observation)
 
     def check(fault: str, expected: str) -> None:
         if fault:

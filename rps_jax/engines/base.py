@@ -26,8 +26,8 @@ import numpy as np
 from rps_jax import engines, errors
 from rps_jax.control.observation import Twist
 from rps_jax.engines import device
-from rps_jax.engines.linear_map import once_differentiable
-from rps_jax.geometry.arrays import Float
+from rps_jax.engines.native import once_differentiable
+from rps_jax.geometry.arrays import Float, Pytree
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
@@ -60,7 +60,7 @@ class ControlPeriod:
     force: bool = field(default=False, metadata={"static": True})
     # Accelerations of each physics step: () to return them, or those of an equal period, from which
     # its derivatives are computed without a solver; None: neither.
-    solutions: Any = None
+    solutions: Pytree = None
 
 
 class Driven(NamedTuple):
@@ -70,7 +70,7 @@ class Driven(NamedTuple):
     # [N, N, N m] wrench of the object on the base, about the base's origin and in its frame; mean
     # over the physics steps of the period; None: not requested.
     force: Float[Any, "*B 3"] | None = None
-    solutions: Any = None  # of `ControlPeriod`, where it requests them
+    solutions: Pytree = None  # of `ControlPeriod`, where it requests them
 
 
 @runtime_checkable
@@ -79,11 +79,11 @@ class Stage(Protocol):
 
     native: ClassVar[bool]  # whether `engines.native` can compile the step of one world
 
-    def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
+    def drive(self, fields: Pytree, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch of worlds with these fields (B, ...) for one control period.
 
         A base is a velocity source at its twist. If its force is limited, it is a body that its
-        drive pushes towards the twist: see `robot.drive.push`.
+        drive pushes towards the twist: see `robot.base.push`.
         """
         ...
 
@@ -180,7 +180,7 @@ class Engine(abc.ABC):
         else:
             return jax.tree.map(once_differentiable, tree)
 
-        def refuse(primals: Any, tangents: Any) -> Any:
+        def refuse(primals: Pytree, tangents: Pytree) -> Pytree:
             raise errors.InputError(refusal)
 
         guarded = jax.custom_jvp(lambda tree: tree)
@@ -188,7 +188,7 @@ class Engine(abc.ABC):
         return guarded(tree)
 
     @abc.abstractmethod
-    def stage(self, inputs: WorldInputs) -> tuple[Any, Any]:
+    def stage(self, inputs: WorldInputs) -> tuple[Pytree, Pytree]:
         """Return the stage, and fields (n, ...) on the host, of worlds of one shape family.
 
         The constants that MuJoCo derives when it compiles a model are computed for all worlds at
@@ -196,7 +196,7 @@ class Engine(abc.ABC):
         """
 
     def open_batch(
-        self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None, fields: Any
+        self, stage: Pytree, qpos: np.ndarray, threads: int, robots: Robot | None, fields: Pytree
     ) -> HostBatch:
         """Return worlds at rest at `qpos` (n, 10), of an engine that JAX does not trace.
 

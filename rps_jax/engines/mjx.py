@@ -32,7 +32,7 @@ from rps_jax.engines.mjx_colliders import (
 from rps_jax.engines.mujoco import compile_rows
 from rps_jax.geometry import planar
 from rps_jax.record.files import Arrays
-from rps_jax.robot import drive as drives
+from rps_jax.robot.base import Tyres, push
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.opengl import mujoco
@@ -117,10 +117,10 @@ class MJXStage(NamedTuple):
                 qvel[JOINTS.base],
             )
             servo: Any = tuple(integral)
-            force, servo = drives.push(robot, servo, twist, tuple(base), turn, timestep)
+            force, servo = push(robot, servo, twist, tuple(base), turn, timestep)
             applied = jnp.stack(force)
             if robot.drive != "omni":
-                tyres = drives.Tyres.of(robot, tuple(base), turn, timestep)
+                tyres = Tyres.of(robot, tuple(base), turn, timestep)
                 applied = applied + jnp.stack(tyres.force)
                 direction = jnp.stack(tyres.sideways)
                 sideways = jnp.asarray(tyres.mass) * jnp.outer(direction, direction)

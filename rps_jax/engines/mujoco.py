@@ -14,7 +14,7 @@ from rps_jax.engines import device
 from rps_jax.engines.base import Driven, Engine, Motion
 from rps_jax.geometry.vectors import turned, turned_back
 from rps_jax.record.files import Arrays
-from rps_jax.robot import drive as drives
+from rps_jax.robot.base import Tyres, push
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.opengl import mujoco, rollout
@@ -33,7 +33,7 @@ def _without_reset(model: mujoco.MjModel) -> mujoco.MjModel:
 
 def _in_base(wrench: np.ndarray, turn: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return wrenches (n, 3) of the world's axes in the base's frame, from (cos, sin) (n,)."""
-    return np.stack([*turned_back(turn, wrench.T), wrench.T[2]], axis=1)
+    return np.stack([*turned_back(turn, tuple(wrench.T)), wrench.T[2]], axis=1)
 
 
 class Batch:
@@ -107,7 +107,7 @@ class Batch:
         omega = twist.T[2]
         yaw = state[:, 1 + JOINTS.base.start + 2] + omega * (substeps * self._timestep / 2)
         turn = np.cos(yaw), np.sin(yaw)
-        velocity = np.stack([*turned(turn, twist.T), omega], axis=1)
+        velocity = np.stack([*turned(turn, tuple(twist.T)), omega], axis=1)
         state[:, 1 + nq :][:, JOINTS.base] = velocity
         states = self._rollout(rows, state, warmstart, nstep=substeps)
         previous = states[:, -2] if substeps > 1 else state
@@ -131,11 +131,11 @@ class Batch:
         for _ in range(substeps):
             yaw, qvel = state[:, 1 + JOINTS.base.start + 2], state[:, 1 + nq :]
             turn, base = (np.cos(yaw), np.sin(yaw)), tuple(qvel[:, JOINTS.base].T)
-            force, integral = drives.push(robots, integral, tuple(twist.T), base, turn, dt, np)
+            force, integral = push(robots, integral, tuple(twist.T), base, turn, dt, np)
             applied[:, 0, JOINTS.base] = np.stack(force, axis=1)
             tyres = None
             if robots.drive != "omni":
-                tyres = drives.Tyres.of(robots, base, turn, dt)
+                tyres = Tyres.of(robots, base, turn, dt)
                 applied[:, 0, JOINTS.base] += np.stack(tyres.force, axis=1)
                 for i, *sideways in zip(rows, *np.broadcast_arrays(*tyres.sideways), strict=True):
                     self.models[i].wrap_prm[:] = sideways

@@ -5,6 +5,10 @@ Here `lowering` prints a function of one world as one C function with a vector l
 or as one CUDA kernel. The compiled library is stored in the program cache, under a key of its
 text, the compiler and the device, with a checksum. Derivatives are compiled in the same way. XLA
 compiles the function where there is no compiler, and in double precision.
+
+Derivatives need linear maps with given transposes. `jax.custom_jvp` alone cannot say how a tangent
+map is transposed, and `jax.custom_vjp` has no forward mode. The primitive of `linear_map` has both,
+and `jax.vmap` maps it. `once_differentiable` refuses second derivatives where they would be wrong.
 """
 
 from __future__ import annotations
@@ -26,24 +30,28 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import Primitive
 from jax.flatten_util import ravel_pytree
+from jax.interpreters import ad, batching, mlir
 
 from rps_jax.engines import device
-from rps_jax.engines.base import Stage
-from rps_jax.engines.linear_map import linear_map, restrict, varied_indices
 from rps_jax.geometry import vectors
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu import WARP, GpuWriter
 from rps_jax.lowering.graph import CompilerError, TooLargeError, UnsupportedError, first_array
 from rps_jax.lowering.writer import HANDLER, SimdWriter
 from rps_jax.record import cache
 
-Pytree: TypeAlias = Any  # of arrays; functions of this module take any
+if TYPE_CHECKING:
+    from rps_jax.engines.base import Stage
+
 Function: TypeAlias = Callable[..., Pytree]
 # XLA, too, fuses a sum with the product before it. No other optimisation may change results.
 _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
@@ -180,7 +188,7 @@ def mapped(function: Function, axes: Sequence[int | None]) -> Function:
         trees = list(map(jax.tree.structure, arguments))
 
         # Records check the shapes of a world: a batch is passed as leaves.
-        def single(*leaves: Sequence[Any]) -> Pytree:
+        def single(*leaves: Sequence[Pytree]) -> Pytree:
             return function(*(tree.unflatten(x) for tree, x in zip(trees, leaves, strict=True)))
 
         inputs = [
@@ -214,12 +222,12 @@ def scan(
     count = len(jax.tree.leaves(state))
 
     def run(values: list[jax.Array], varied: Collection[int] | None = None) -> Pytree:
-        groups: dict[Any, list[int]] = {}  # of the state, then of the constants
+        groups: dict[tuple[object, ...], list[int]] = {}  # of the state, then of the constants
         for i, x in enumerate(values):
             key = i >= count, x.dtype, i >= count and i in (varied or ())
             groups.setdefault(key, []).append(i)
         carried = sum(not is_constant for is_constant, *_ in groups)
-        restore: Any = [ravel_pytree([values[i][0] for i in x])[1] for x in groups.values()]
+        restore: Pytree = [ravel_pytree([values[i][0] for i in x])[1] for x in groups.values()]
 
         def packed(leaves: Sequence[jax.Array], indices: Sequence[list[int]]) -> list[jax.Array]:
             return [ravel_pytree([leaves[i] for i in x])[0] for x in indices]
@@ -245,7 +253,7 @@ def scan(
         end = jax.vmap(lambda x: unpacked(x, indices[:carried]))(end)
         return jax.tree.structure(state).unflatten(end), outputs
 
-    def rule(primals: Any, tangents: Any) -> Any:
+    def rule(primals: Pytree, tangents: Pytree) -> Pytree:
         ((values,), (directions,)) = primals, tangents
         indices = varied_indices(directions)
         of_varied, point = restrict(functools.partial(run, varied=indices), values, indices)
@@ -273,15 +281,15 @@ def _tangents(
     varied = varied_indices(directions)
     real = [i for i, x in enumerate(result_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-    def real_results(values: Sequence[Any]) -> list[Any]:
+    def real_results(values: Sequence[Pytree]) -> list[Pytree]:
         leaves = jax.tree.leaves(function(*tree.unflatten(values)))
         return [leaves[i] for i in real]
 
-    def push(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
+    def push(values: Sequence[Pytree], vectors: Sequence[Pytree]) -> list[Pytree]:
         of_varied, point = restrict(real_results, values, varied)
         return jax.jvp(of_varied, (point,), (list(vectors),))[1]
 
-    def pull(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
+    def pull(values: Sequence[Pytree], vectors: Sequence[Pytree]) -> list[Pytree]:
         of_varied, point = restrict(real_results, values, varied)
         return jax.vjp(of_varied, point)[1](list(vectors))[0]
 
@@ -297,7 +305,7 @@ def concurrent(
     functions: Sequence[Function],
     fallback: Callable[..., Sequence[Pytree]],
     sort_by: Callable[..., jax.Array] | None = None,
-) -> Callable[..., Any]:
+) -> Callable[..., Pytree]:
     """Return functions of batches of worlds as one function; a GPU runs them at the same time.
 
     Args:
@@ -311,7 +319,9 @@ def concurrent(
         return fallback
 
     @functools.cache
-    def compiled(types: Sequence[tuple[Any, Sequence[Any]]]) -> tuple[list[_Function], Any]:
+    def compiled(
+        types: Sequence[tuple[Pytree, Sequence[Pytree]]],
+    ) -> tuple[list[_Function], Pytree]:
         calls = [_Function(f, *x, sort_by) for f, x in zip(functions, types, strict=True)]
         groups = [calls] if jax.default_backend() == "gpu" else [[call] for call in calls]
         return calls, [(group, _compiled(group)) for group in groups]
@@ -329,7 +339,7 @@ def concurrent(
             inputs = [[*x, order] for x, order in zip(inputs, orders, strict=True)]
         flat_inputs, inputs_tree = jax.tree.flatten(inputs)
 
-        def run_libraries(values: Sequence[Any], _: Any) -> list[jax.Array]:
+        def run_libraries(values: Sequence[Pytree], _: Pytree) -> list[jax.Array]:
             """Call the libraries, for which it waits until they are compiled."""
             leaves = inputs_tree.unflatten(values)
             try:
@@ -380,8 +390,8 @@ class _Function:
     def __init__(
         self,
         function: Function,
-        tree: Any,
-        types: Sequence[tuple[Any, Any]],
+        tree: Pytree,
+        types: Sequence[tuple[Pytree, Pytree]],
         sort_by: Callable[..., jax.Array] | None,
     ) -> None:
         self.inputs = [jax.ShapeDtypeStruct(shape[1:], dtype) for shape, dtype in types]
@@ -501,3 +511,121 @@ def _register(name: str, body: bytes) -> bool:
     jax.ffi.register_ffi_target(name, function, platform=_PLATFORMS[jax.default_backend()])
     libraries[name] = library
     return True
+
+
+# --- linear maps ---------------------------------------------------------------------------------
+
+# Of residuals (on which the map depends) and of vectors: tuples of arrays.
+Map: TypeAlias = Callable[[Sequence[Pytree], Sequence[Pytree]], Sequence[jax.Array]]
+Maps: TypeAlias = tuple[Map, Map | None]
+
+
+def linear_map(
+    forward: Map,
+    transpose: Map | None,
+    residuals: Sequence[Pytree],
+    vectors: Sequence[Pytree],
+    like: Pytree,
+    label: str = "",
+) -> list[jax.Array]:
+    """Return `forward(residuals, vectors)`, linear in the vectors, with a given transpose.
+
+    Args:
+      forward: the map.
+      transpose: from residuals and vectors of the results to vectors of the arguments; None of a
+        map without vectors, a function of the residuals.
+      residuals: arrays that are not differentiated.
+      vectors: arrays.
+      like: results have the shapes and types of these arrays.
+      label: name of the map in a jaxpr.
+    """
+    outs = tuple(jax.core.ShapedArray(x.shape, x.dtype) for x in like)
+    static = {"maps": (forward, transpose), "count": len(residuals), "outs": outs}
+    return _primitive.bind(*residuals, *vectors, **static, label=label)
+
+
+def varied_indices(tangents: Sequence[object]) -> list[int]:
+    """Return the indices of the tangents that are not zero, in a rule with `symbolic_zeros`."""
+    return [i for i, x in enumerate(tangents) if not isinstance(x, SymbolicZero)]
+
+
+def restrict(
+    function: Callable[[list[Pytree]], Pytree], values: Sequence[Pytree], indices: Sequence[int]
+) -> tuple[Callable[[list[Pytree]], Pytree], list[Pytree]]:
+    """Return a function of some entries of its list, the others constant, and these entries."""
+
+    def restricted(entries: list[Pytree]) -> Pytree:
+        replaced = dict(zip(indices, entries, strict=True))
+        return function([replaced.get(i, x) for i, x in enumerate(values)])
+
+    return restricted, [values[i] for i in indices]
+
+
+def once_differentiable(x: object) -> object:
+    """Return a leaf of a pytree by which JAX refuses second derivatives."""
+    is_real = isinstance(x, jax.core.Tracer) and jnp.issubdtype(x.dtype, jnp.inexact)
+    return _once.bind(x, derived=False) if is_real else x
+
+
+_primitive = Primitive("linear_map")
+_primitive.multiple_results = True
+
+
+@_primitive.def_impl
+def _run(*arrays: Pytree, maps: Maps, count: int, **_: object) -> list[jax.Array]:
+    return list(maps[0](arrays[:count], arrays[count:]))
+
+
+_primitive.def_abstract_eval(lambda *_, outs, **__: outs)
+
+
+def _transpose(
+    cotangents: Pytree, *arrays: Pytree, maps: Maps, count: int, outs: Pytree, label: str
+) -> Pytree:
+    vectors = [
+        jnp.zeros(out.shape, out.dtype) if isinstance(x, ad.Zero) else x
+        for x, out in zip(cotangents, outs, strict=True)
+    ]
+    like = [x.aval for x in arrays[count:]]
+    forward, transpose = maps
+    assert transpose is not None  # a map without vectors is not transposed
+    moved = linear_map(transpose, forward, arrays[:count], vectors, like, label)
+    return [None] * count + moved
+
+
+def _batch(
+    arrays: Pytree, axes: Pytree, *, maps: Maps, count: int, outs: Pytree, label: str
+) -> Pytree:
+    size = next(x.shape[i] for x, i in zip(arrays, axes, strict=True) if i is not None)
+    whole = [
+        jnp.broadcast_to(x, (size, *x.shape)) if i is None else jnp.moveaxis(x, i, 0)
+        for x, i in zip(arrays, axes, strict=True)
+    ]
+    like = [jax.ShapeDtypeStruct((size, *out.shape), out.dtype) for out in outs]
+    forward, transpose = jax.vmap(maps[0]), maps[1] and jax.vmap(maps[1])
+    results = linear_map(forward, transpose, whole[:count], whole[count:], like, label)
+    return results, [0] * len(outs)
+
+
+def _refuse(*_: object, **__: Pytree) -> Pytree:
+    raise NotImplementedError(
+        "trials have no second derivatives: differentiate once, or take differences of gradients."
+    )
+
+
+ad.primitive_jvps[_primitive] = _refuse
+ad.primitive_transposes[_primitive] = _transpose
+batching.primitive_batchers[_primitive] = _batch
+mlir.register_lowering(_primitive, mlir.lower_fun(_run, multiple_results=True))
+
+
+def _jvp_once(primals: Pytree, tangents: Pytree, derived: bool) -> tuple[jax.Array, Pytree]:
+    return _refuse() if derived else (_once.bind(*primals, derived=True), *tangents)
+
+
+_once = Primitive("once_differentiable")
+_once.def_impl(lambda x, **_: x)
+_once.def_abstract_eval(lambda x, **_: x)
+ad.primitive_jvps[_once] = _jvp_once
+batching.defvectorized(_once)
+mlir.register_lowering(_once, lambda _, x, **__: [x])

@@ -18,7 +18,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -27,6 +27,7 @@ from jax.sharding import SingleDeviceSharding
 
 from rps_jax.control.base import Law
 from rps_jax.engines import native
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.record import cache
 
 if TYPE_CHECKING:
@@ -34,13 +35,13 @@ if TYPE_CHECKING:
 
 
 def trace_function(
-    function: Callable[..., Any],
-    arguments: Sequence[Any],
+    function: Callable[..., Pytree],
+    arguments: Sequence[Pytree],
     *,
     law: Law,
     donate: int,
     static: Sequence[object],
-) -> Callable[[Device | None], Callable[..., Any]]:
+) -> Callable[[Device | None], Callable[..., Pytree]]:
     """Trace a function for arguments of some shapes, or load its program from the cache.
 
     Args:
@@ -58,7 +59,7 @@ def trace_function(
     donated = tuple(jax.tree.leaves(jax.tree.unflatten(tree, range(len(leaves)))[donate]))
     structures: list[pytree.PyTreeDef] = []  # of the results, once traced
 
-    def flat(*inputs: Any) -> list[Any]:
+    def flat(*inputs: object) -> list[object]:
         results, structure = jax.tree.flatten(function(*jax.tree.unflatten(tree, inputs)))
         structures[:] = [structure]
         return results
@@ -82,7 +83,7 @@ def trace_function(
         jitted = jax.jit(exported.call, donate_argnums=donated)
 
     @functools.cache
-    def compiled(device: Device | None) -> Callable[..., Any]:
+    def compiled(device: Device | None) -> Callable[..., object]:
         sharding = None if device is None else SingleDeviceSharding(device)
         placed = (x.update(sharding=sharding) for x in leaves)
         program = _compile_lowered(jitted.lower(*placed))
@@ -191,7 +192,7 @@ def _path_of(inputs: str) -> Path | None:
     return Path(folder) / "traced" / key
 
 
-def _read(path: Path, leaves: Sequence[Any]) -> tuple[pytree.PyTreeDef, export.Exported] | None:
+def _read(path: Path, leaves: Sequence[Pytree]) -> tuple[pytree.PyTreeDef, export.Exported] | None:
     """Return a cached program and the structure of its results, if it fits these arguments."""
 
     def parse(body: bytes) -> tuple[pytree.PyTreeDef, export.Exported]:

@@ -136,8 +136,11 @@ def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tupl
         None if slider.pads is None else _turned(slider.pads, pushed[2] - base[2]),
     )
     v = solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
-    moves = [sp.scale(dt, (*sp.turned(turn, u), u[2])) for u in (twist, v)]
-    return sp.add(base, moves[0]), sp.add(pushed, moves[1])
+
+    def moved(x: Vec, u: Vec) -> Vec:
+        return sp.add(x, sp.scale(dt, (*sp.turned(turn, u), u[2])))
+
+    return moved(base, twist), moved(pushed, v)
 
 
 def solve(problem: Problem, v: Vec, dt: float) -> Vec:

@@ -27,6 +27,7 @@ Vector = Float[Array, "2"]  # in the plane: x and y
 Number = float | Array | np.ndarray  # of one world, or of a batch, of any shape
 Pair = tuple[Array, Array]
 Parameter = float | Array  # of a law or a sensor; an array in a batch
+Pytree = Any  # of arrays
 Entries = Any  # an array, or a tuple of numbers: one for each index of its last axis
 
 

@@ -184,7 +184,7 @@ def _windows(
         yield position, starts, inside
 
 
-def fill_of(dtype: np.dtype, fill_value: Any) -> np.ndarray:
+def fill_of(dtype: np.dtype, fill_value: object) -> np.ndarray:
     """Return what `gather` returns for an index out of bounds."""
     return np.asarray(_FILL[dtype.kind] if fill_value is None else fill_value, dtype)
 

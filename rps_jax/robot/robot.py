@@ -38,7 +38,7 @@ class Robot:
     """A base, its drive and its limits. A pytree whose numbers may be batched.
 
     Twists and limits are in the robot frame, x forward and y left. A base with another drive than
-    `omni` has an axle that cannot move sideways: see `robot.drive`.
+    `omni` has an axle that cannot move sideways: see `robot.base`.
     """
 
     half_length: Annotated[Number, Spec("m", "half length of the base")] = HALF_LENGTH  # ()

@@ -31,8 +31,8 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.files import JsonObject
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan, Shard, chunks_by_key
-from rps_jax.trials.jobs import BatchOptions
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
+from rps_jax.trials.worlds import BatchOptions
 
 PATIENCE = 10.0  # [s] to reach a cluster
 RETRIES = 16  # of a task

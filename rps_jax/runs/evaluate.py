@@ -22,13 +22,13 @@ from rps_jax.record import cache, provenance
 from rps_jax.record import options as options_
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import batch
-from rps_jax.trials.batch_run import Candidates, outcomes
-from rps_jax.trials.jobs import BatchOptions
+from rps_jax.trials.batch import outcomes
 from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
 from rps_jax.trials.results import POSE, WORLD, labelled, variable
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import Outcome
+from rps_jax.trials.worlds import BatchOptions, Candidates
 from rps_jax.world import points as points_
 from rps_jax.world.domain import DomainLike, name_or_custom, parse_domain, task_attribute
 from rps_jax.world.tasks import TaskLike

@@ -21,10 +21,10 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.plan import Plan, Shard, open_run, shard_chunks
 from rps_jax.runs.results import PlanRequest, Results, name_of
-from rps_jax.trials.batch_run import run_batch
-from rps_jax.trials.jobs import BatchOptions, BatchSize
+from rps_jax.trials.batch import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.trials.trial import Outcome
+from rps_jax.trials.worlds import BatchOptions, BatchSize
 
 StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk and its content
 # Runs the missing chunks of a shard in a folder, and may return their results.

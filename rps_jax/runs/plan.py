@@ -29,9 +29,8 @@ from rps_jax.record import files, manifest, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.files import JsonObject
 from rps_jax.record.manifest import Stored
-from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.worlds import drawn_scene, drawn_worlds
+from rps_jax.trials.worlds import WorldBatch, drawn_scene, drawn_worlds
 from rps_jax.world import draws, points
 from rps_jax.world.domain import STORED as STORED_DOMAIN
 from rps_jax.world.domain import Domain, name_or_custom, task_attribute

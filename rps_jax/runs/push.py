@@ -44,12 +44,12 @@ from rps_jax.runs.question import Question, Run, SimulationQuestion, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.batch import slots_of
 from rps_jax.trials.case import Case, TrialOptions
-from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.progress import Bar
 from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, object_pose, p_world_contact
+from rps_jax.trials.worlds import WorldBatch, rows
 from rps_jax.world import paper, tasks
 from rps_jax.world.scene import Scene
 

@@ -26,11 +26,10 @@ from rps_jax.record.files import Arrays
 from rps_jax.record.table import check_parquet
 from rps_jax.runs.plan import Plan, chunks_by_key, draw
 from rps_jax.spec import specs_of
-from rps_jax.trials.jobs import Job, WorldBatch
 from rps_jax.trials.results import POSE, WORLD, labelled, variable
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
-from rps_jax.trials.worlds import drawn_worlds
+from rps_jax.trials.worlds import Job, WorldBatch, drawn_worlds
 from rps_jax.world import draws, points
 
 # Types of an outcome's columns; the rest are float32.

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import xarray as xr
 
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.trials.jobs import BatchOptions
 from rps_jax.trials.progress import ProgressCallback
+from rps_jax.trials.worlds import BatchOptions
 
 
 class Run(NamedTuple):

@@ -35,10 +35,11 @@ from rps_jax.runs.plan import attributes_of, load_plan
 from rps_jax.runs.question import DomainQuestion, Rows, count_true
 from rps_jax.studies.gallery import failure_modes
 from rps_jax.trials import score
-from rps_jax.trials.batch_run import Candidates, outcomes
+from rps_jax.trials.batch import outcomes
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import labelled
 from rps_jax.trials.trial import Outcome
+from rps_jax.trials.worlds import Candidates
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ from rps_jax.laws import LawParams
 from rps_jax.questions import Run
 from rps_jax.record import files
 from rps_jax.trials import score
-from rps_jax.trials.batch_run import Candidates, outcomes
+from rps_jax.trials.batch import outcomes
 from rps_jax.trials.progress import SequentialProgress, no_progress
+from rps_jax.trials.worlds import Candidates
 from rps_jax.world import points
 from rps_jax.world.points import Points
 

@@ -1,4 +1,12 @@
-"""Batches of trials: a compiled program steps slots, and each slot is refilled when its trial ends.
+"""Batch runs: a compiled program steps slots, and each slot is refilled when its trial ends.
+
+A `Request` has the worlds of its trials, by the program that steps them. There are three kinds:
+named cases (`pushes.Cases`), the chunks of a sweep (`runs.results.Results`), and `Candidates`.
+
+    request = Candidates(stack(["rps", "rps,L=0.2"]), [domain], seed=3, worlds=np.arange(100))
+    (outcome,), timing = outcomes([request], setting)
+    outcome.success      # (2, 100)
+    request.distances    # (100,) [m] from the start to the target
 
 A job holds the trials that one program can step: one law, one shape family. Its worlds are built
 batch by batch when slots become free, so that memory does not grow with the number of trials.
@@ -22,14 +30,15 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 import threading
 import time
 import warnings
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol, Unpack
 
 import jax
 import numpy as np
@@ -37,12 +46,13 @@ import numpy as np
 from rps_jax import engines, errors
 from rps_jax.control.base import Law
 from rps_jax.engines import device, programs
+from rps_jax.record.files import Arrays
 from rps_jax.trials import law_check, segments, trial
-from rps_jax.trials.jobs import Collect, Inputs, Job, Tree, WorldBatch, rows
 from rps_jax.trials.progress import Progress, ProgressCallback, Segment, Timing, no_progress
 from rps_jax.trials.segments import Ended, Fill, Filled, Launch, Read, Report, Slots
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, SegmentState, Trial
+from rps_jax.trials.worlds import BatchOptions, Collect, Inputs, Job, Tree, WorldBatch, rows
 from rps_jax.world.physics import Physics
 
 if TYPE_CHECKING:
@@ -53,6 +63,96 @@ _REPORT_STEPS = 500  # control steps between two reports of an engine outside of
 _FIRST_TRIALS = 16384  # of a job on a GPU in the first segment, while more are built
 _TAIL_SLOTS = 8192  # of a job, on a GPU on which no trial waits
 _MAX_SIDE_BY_SIDE = 4  # jobs in one program; more would take long to compile
+
+
+class Request(Protocol):
+    """Trials to run."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the outcomes, in which the index of a trial counts in row-major order."""
+        ...
+
+    def jobs(self, setting: Setting) -> Iterable[Job]:
+        """Return the worlds and law parameters of the trials, by the program that steps them."""
+        ...
+
+
+class RunOptions(BatchOptions, total=False):
+    """Keyword arguments of `run_batch`."""
+
+    capacity: Callable[[int], int]
+
+
+def run_batch(
+    requests: Sequence[Request],
+    setting: Setting,
+    collect: Collect,
+    *,
+    capacity: Callable[[int], int] = lambda trials: trials,
+    **options: Unpack[BatchOptions],
+) -> Timing:
+    """Run every trial of every request to its end.
+
+    Args:
+      requests: their trials share programs. The indices of the trials of a request follow those of
+        the previous request.
+      setting: engine, physics and rules.
+      collect: called with trials that ended, in any order, by one thread at a time.
+      capacity: number of trials that a program has slots for, by the number of its trials.
+      options: slots, workers and callback, as of `run`.
+
+    Returns:
+      Where the time went.
+    """
+    groups: dict[Hashable, list[tuple[int, Iterable[WorldBatch]]]] = {}
+    for request, first in zip(requests, _first_trials(requests), strict=False):
+        for program, count, batches in request.jobs(setting):
+            groups.setdefault(program, []).append((count, _shifted(batches, first)))
+    jobs = []
+    for program, group in groups.items():
+        counts, batches = zip(*group, strict=True)
+        whole = itertools.chain.from_iterable(batches)
+        jobs.append(Job(program, capacity(sum(counts)), whole))
+    return run(jobs, setting, collect=collect, **options)
+
+
+def _shifted(batches: Iterable[WorldBatch], first: int) -> Iterator[WorldBatch]:
+    """Yield batches with indices of trials that count from `first`."""
+    for batch in batches:
+        yield batch._replace(indices=first + batch.indices)
+
+
+def outcomes(
+    requests: Sequence[Request], setting: Setting, **options: Unpack[RunOptions]
+) -> tuple[list[Outcome], Timing]:
+    """Run every trial of every request by `run_batch`, and collect the outcomes in arrays.
+
+    Returns:
+      The outcomes of each request, on the host with leaves (*shape, ...); and where the time went.
+    """
+    columns: Arrays = {}
+    *firsts, count = _first_trials(requests)
+
+    def collect(indices: np.ndarray, ended: Outcome) -> None:
+        for name, leaf in ended.columns().items():
+            if name not in columns:
+                columns[name] = np.empty((count, *leaf.shape[1:]), leaf.dtype)
+            columns[name][indices] = leaf
+
+    timing = run_batch(requests, setting, collect, **options)
+    whole = Outcome.of_columns(columns)
+    trials = (np.arange(math.prod(x.shape)).reshape(x.shape) for x in requests)
+    pairs = zip(firsts, trials, strict=True)
+    return [rows(whole, first + index) for first, index in pairs], timing
+
+
+def _first_trials(requests: Sequence[Request]) -> list[int]:
+    """Return the index of the first trial of each request, and the number of all trials."""
+    return np.cumsum([0, *(math.prod(request.shape) for request in requests)]).tolist()
+
+
+# --- jobs --------------------------------------------------------------------------------------
 
 
 def run(
@@ -103,8 +203,8 @@ def run(
             for x in itertools.chain(*groups)
             for d in devices
         ]
-        for program in (group[0] for group in groups):
-            for queue in program.queues:
+        for program, *_ in groups:
+            for queue in program.queues if programs.identity(program.law) is None else ():
                 check = partial(law_check.warn_of_difference, queue.example, setting)
                 monitor.isolate(program.key, check)
         monitor.programs = len(compilations)
@@ -395,7 +495,7 @@ class _SlotData:
         return _Running(slots.trials[at], inputs, trials, slots.first[at] >= launched)
 
 
-def _write(tree: Tree, index: Any, values: Tree) -> None:
+def _write(tree: Tree, index: object, values: Tree) -> None:
     """Write the rows `index` of every leaf."""
     for target, source in zip(jax.tree.leaves(tree), jax.tree.leaves(values), strict=True):
         target[index] = source

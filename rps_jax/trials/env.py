@@ -36,10 +36,9 @@ from rps_jax.geometry.arrays import Pair
 from rps_jax.record.options import check_fields, option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
-from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Measurement, SingleWorld, Trial, World
-from rps_jax.trials.worlds import drawn_scene, drawn_worlds, soften_skins
+from rps_jax.trials.worlds import WorldBatch, drawn_scene, drawn_worlds, rows, soften_skins
 from rps_jax.world import domain, draws, objects, video
 from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 from rps_jax.world.draws import Draw
@@ -80,7 +79,7 @@ class State:
     # `world`: the World; `index`: its index in the domain; `observation`: the TaxelObservation.
     info: dict[str, Any]
 
-    def replace(self, **changes: Any) -> State:
+    def replace(self, **changes: object) -> State:
         """Return the state with other values."""
         return dataclasses.replace(self, **changes)
 

@@ -15,7 +15,7 @@ processes must be spawned, since JAX hangs in a forked one: `gymnasium.make_vec(
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -28,7 +28,7 @@ from rps_jax.control import soft
 from rps_jax.engines import device
 from rps_jax.record.files import Arrays
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
-from rps_jax.trials.jobs import rows
+from rps_jax.trials.worlds import rows
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import DomainLike
 
@@ -40,6 +40,7 @@ try:
 except ImportError as error:
     raise errors.not_installed("gymnasium", "gym") from error
 
+Infos = dict[str, Any]
 _SEEDS = 2**32  # of one word of a key
 
 
@@ -108,8 +109,8 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
         self.metadata = self.metadata | {"render_fps": round(1 / self._vector.period) or 1}
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[np.ndarray, dict[str, object]]:
         """Start in a random world, which depends on the seed; there are no `options`."""
         if options:
             raise errors.not_allowed("options", options, "this environment has none")
@@ -117,14 +118,14 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
         obs, info = self._vector.reset(seed=seed)
         return obs[0], self._info(info)
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Infos]:
         """Execute an action (3,), or (2,) on a base that cannot move sideways."""
         *results, infos = self._vector.step([action])
         obs, reward, terminated, truncated = (values[0] for values in results)
         return obs, float(reward), bool(terminated), bool(truncated), self._info(infos)
 
     @staticmethod
-    def _info(infos: Mapping[str, Any]) -> dict[str, Any]:
+    def _info(infos: Infos) -> Infos:
         """Return the infos of the only world that it has, without masks."""
         return {name: infos[name][0].item() for name in infos if infos.get(f"_{name}", [False])[0]}
 
@@ -225,8 +226,8 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        options: dict[str, object] | None = None,
+    ) -> tuple[np.ndarray, dict[str, object]]:
         """Start in random worlds, which depend on their seeds: all, or those of a `reset_mask`."""
         device.check_process()  # not at construction, where workers cannot report an error
         for name in options or {}:
@@ -242,7 +243,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         obs, _, _, infos = self.observe()
         return obs, self._with_masks(infos, where)
 
-    def _checked_mask(self, mask: Any) -> np.ndarray:
+    def _checked_mask(self, mask: object) -> np.ndarray:
         """Return the mask (num_envs,) of the worlds to reset, by default of all."""
         if mask is None:
             return np.ones(self.num_envs, bool)
@@ -270,9 +271,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._keys = keys if self._keys is None else jnp.where(known & where, keys, self._keys)
 
     @device.standard_jax()
-    def step(
-        self, actions: Any
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Execute actions (num_envs, 3), or (num_envs, 2)."""
         device.check_process()
         mode = self.metadata["autoreset_mode"]
@@ -312,7 +311,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return tuple(self.push_env.render([rows(self.state, i) for i in range(self.num_envs)]))
 
     @staticmethod
-    def _with_masks(infos: Mapping[str, Any], where: np.ndarray) -> dict[str, Any]:
+    def _with_masks(infos: Infos, where: np.ndarray) -> Infos:
         """Return infos, each with the mask of the worlds that have it; none has NaN."""
         masks = {
             name: where & ~np.isnan(x) if np.asarray(x).dtype.kind == "f" else where.copy()

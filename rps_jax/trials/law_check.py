@@ -9,20 +9,21 @@ from __future__ import annotations
 import functools
 import itertools
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.engines import native, programs
+from rps_jax.engines import native
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Trial
 from rps_jax.world.scene import JOINTS
 
 if TYPE_CHECKING:
-    from rps_jax.trials.jobs import WorldBatch
+    from rps_jax.trials.worlds import WorldBatch
 
 _WORLDS, _STEPS = 2, 150
 _TOLERANCE = 1e-3  # of the largest number
@@ -35,15 +36,15 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
     It runs in the first worlds of a batch. The result is cached with the compiled law.
     """
     law, period = batch.law, setting.physics.control_period
-    if not native.compiles(batch.stage) or programs.identity(law) is not None:
+    if not native.compiles(batch.stage):
         return
     worlds, params = jax.tree.map(lambda x: jnp.asarray(x[:_WORLDS]), batch.inputs)
     loop = ControlLoop(setting.physics, law=law)
 
-    def step(*arguments: Any) -> Any:
+    def step(*arguments: Pytree) -> Pytree:
         return law.step(*arguments)[:2]
 
-    def turn(trials: Trial, _: None) -> tuple[Trial, Any]:
+    def turn(trials: Trial, _: None) -> tuple[Trial, Pytree]:
         """Run the law once, and move the bases on a curve, without physics."""
         axes = (0, 0, 0, None)
         judged, _measured, obs = jax.vmap(trial.perceive, axes)(worlds, params, trials, loop)
@@ -55,7 +56,7 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
         trials = judged._replace(qpos=qpos, steps=judged.steps + 1, law_state=states)
         return trials, (arguments, (states, twists))
 
-    def run() -> Any:
+    def run() -> Pytree:
         """Return arguments and results of the law in each control step (steps * worlds, ...)."""
         start = jax.vmap(functools.partial(trial.start, law=law))(worlds, params)
         records = jax.lax.scan(turn, start, length=_STEPS)[1]

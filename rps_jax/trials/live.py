@@ -21,9 +21,9 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin, Skin
 from rps_jax.trials import trial
 from rps_jax.trials.batch import stepper
-from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
+from rps_jax.trials.worlds import WorldBatch, rows
 from rps_jax.world.tasks.base import heading_of
 
 CHUNK = 25  # steps, at most, between two checks of the clock
@@ -153,7 +153,7 @@ class Live:
         self._worlds = self._worlds._replace(shift=shift)
         self._continue()
 
-    def _continue(self, **changes: Any) -> None:
+    def _continue(self, **changes: object) -> None:
         """Continue a trial that has succeeded, with changes of its state."""
         success = np.zeros_like(self._trial.success)
         done = np.array(self._trial.diverged)

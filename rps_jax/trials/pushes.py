@@ -5,7 +5,7 @@ import time
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, Unpack
+from typing import NamedTuple, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -16,16 +16,16 @@ from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import device
 from rps_jax.geometry import solid
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.robot import Robot
 from rps_jax.trials import trial, worlds
-from rps_jax.trials.batch import stepper
-from rps_jax.trials.batch_run import outcomes
+from rps_jax.trials.batch import outcomes, stepper
 from rps_jax.trials.case import Case
-from rps_jax.trials.jobs import BatchOptions, Job, WorldBatch, rows
 from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
+from rps_jax.trials.worlds import BatchOptions, Job, WorldBatch, rows
 from rps_jax.world import draws, scene
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
@@ -141,7 +141,7 @@ def kind(case: Case) -> Hashable:
     return FAMILIES[case.object_name], type(case.params), structure, case.challenge.shape
 
 
-def _stack(trees: Sequence[Any], dtype: Any = float) -> Any:
+def _stack(trees: Sequence[Pytree], dtype: Pytree = float) -> Pytree:
     """Return pytrees of numbers stacked leaf by leaf."""
     return jax.tree.map(lambda *leaves: np.array([np.asarray(x) for x in leaves], dtype), *trees)
 

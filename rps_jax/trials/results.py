@@ -1,7 +1,6 @@
 """Labelled data of outcomes: a grid of trials, or one trial over time."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -16,12 +15,13 @@ from rps_jax.spec import specs_of
 from rps_jax.trials import trial
 from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.trial import Outcome
-from rps_jax.world import streams, tasks
+from rps_jax.world import tasks
+from rps_jax.world.quantity import claim
 
 DIMS = ("law", "object", "friction", "target")
 WORLD = "index of the world"
 POSE = xr.Variable("pose", ["x", "y", "yaw"], {"long_name": "x [m], y [m] and yaw [rad]"})
-streams.claim("an outcome", *specs_of(Outcome), "law", "world")
+claim("an outcome", *specs_of(Outcome), "law", "world")
 _TRACED = {**specs_of(Twist), **specs_of(Details)}  # numbers of a trace
 
 
@@ -54,7 +54,7 @@ def outcome_dataset(
 ) -> xr.Dataset:
     """Return outcomes (S * O * F * T, ...), nested in this order, as a dataset with `DIMS`."""
     axes = laws, objects, frictions, range(len(targets))
-    coords: dict[str, Any] = {dim: list(x) for dim, x in zip(DIMS, axes, strict=True)}
+    coords: dict[str, object] = {dim: list(x) for dim, x in zip(DIMS, axes, strict=True)}
     for name, values in zip(("target_x", "target_y"), np.asarray(targets, float).T, strict=True):
         coords[name] = "target", values, {"units": "m"}
     variables = {}
@@ -113,11 +113,12 @@ def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
     shell = world.skin.shell
     sizes = {"half_length": shell.half[0], "half_width": shell.half[1], "base_radius": shell.radius}
     for name, value in sizes.items():
-        attrs = {"units": "m", "long_name": f"{name.replace('_', ' ')} of the base"}
+        meaning = f"{name.replace('_', ' ')} of the base"
         if value is not None:
-            variables[name] = xr.Variable((), float(value), attrs)
-    attrs = {"units": "m", "long_name": "outline of the object in its own frame"}
-    variables["outline"] = xr.Variable(("corner", "axis"), _outline(world.footprint), attrs)
+            variables |= labelled(**{name: ((), float(value), "m", meaning)})
+    meaning = "outline of the object in its own frame"
+    shape = ("corner", "axis"), _outline(world.footprint)
+    variables |= labelled(outline=(*shape, "m", meaning))
     return xr.Dataset(variables, coords={"time": ("time", snapshots.time, {"units": "s"})})
 
 

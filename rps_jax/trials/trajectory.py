@@ -23,10 +23,9 @@ from rps_jax.engines.base import Stage
 from rps_jax.record.options import check_arguments
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
-from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Trial, World
-from rps_jax.trials.worlds import drawn_worlds, soften_skins
+from rps_jax.trials.worlds import WorldBatch, drawn_worlds, soften_skins
 from rps_jax.world import draws
 from rps_jax.world.domain import DomainLike, parse_domain
 from rps_jax.world.tasks import TaskLike

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,11 +40,10 @@ from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Ints, Scalar, Vector
+from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Ints, Pytree, Scalar, Vector
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot import base, drive
-from rps_jax.robot.base import Load, Odometry
-from rps_jax.robot.drive import Drive
+from rps_jax.robot import base
+from rps_jax.robot.base import Drive, Load, Odometry
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE, IdealSkin, Reading, Skin, SkinState
 from rps_jax.spec import Spec
@@ -107,7 +106,7 @@ class Shift(NamedTuple):
 class World(NamedTuple):
     """Object, robot, sensors and task of one world; every leaf is batched."""
 
-    fields: Any  # for its engine's stage
+    fields: Pytree  # for its engine's stage
     footprint: Footprint
     skin: Skin
     p_world_target: Float[Array, "*B 2"]  # [m]
@@ -116,7 +115,7 @@ class World(NamedTuple):
     key: jax.Array  # of the imperfections of skin and odometry
     odometry: Odometry = Odometry()
     robot: Robot | None = None  # with limits; None follows every twist
-    task: Any = reach.Nothing()  # a `Course`
+    task: Pytree = reach.Nothing()  # a `Course`
 
 
 class Trial(NamedTuple):
@@ -127,7 +126,7 @@ class Trial(NamedTuple):
     # Of these [m/s, rad/s]; the object's angular velocity is in its own frame.
     qvel: Float[Array, "*B 9"]
     warmstart: Float[Array, "*B 9"]  # [m/s^2, rad/s^2] last accelerations, for the solver
-    law_state: Any  # what the law remembers
+    law_state: Pytree  # what the law remembers
     skin: SkinState
     poses: Float[Array, "*B K 3"]  # [m, m, rad] of the base in the last steps, the latest first
     twists: Float[Array, "*B K 3"]  # [m/s, m/s, rad/s] commanded, the latest first
@@ -148,7 +147,7 @@ class Trial(NamedTuple):
     nan_twist: Bools  # the law returned a twist that is not finite
     drive: Drive | None = None  # of a robot with limits
     load: Load | None = None  # of a law that senses the contact's force
-    task: Any = reach.Nothing()  # progress of the task
+    task: Pytree = reach.Nothing()  # progress of the task
 
 
 class Snapshot(NamedTuple):
@@ -197,12 +196,12 @@ class Outcome(NamedTuple):
     ]
     task: Mapping[str, Array] = MappingProxyType({})  # by name: see `Task.OUTCOMES`
 
-    def columns(self) -> dict[str, Any]:
+    def columns(self) -> dict[str, Pytree]:
         """Return all outcomes by name."""
         return {name: x for name, x in self._asdict().items() if name != "task"} | dict(self.task)
 
     @classmethod
-    def of_columns(cls, columns: Mapping[str, Any]) -> Outcome:
+    def of_columns(cls, columns: Mapping[str, Pytree]) -> Outcome:
         """Return the outcome of all columns by name."""
         fields = {name: columns[name] for name in cls._fields if name in columns}
         return cls(**fields, task={k: x for k, x in columns.items() if k not in fields})
@@ -217,11 +216,8 @@ def object_pose(qpos: Float[Array, "10"]) -> tuple[Vector, Float[Array, ""]]:
 @jax.jit
 def p_world_contact(snapshots: Snapshot) -> Float[Array, "T 2"]:
     """Return the contact points of snapshots (T, ...) in the world [m]; NaN without contact."""
-    qpos, reading = snapshots.qpos, snapshots.reading
-    point = qpos[:, JOINTS.base_position] + planar.rotate(
-        qpos[:, JOINTS.base_yaw], reading.p_robot_contact
-    )
-    return jnp.where((reading.contact_type != NONE)[:, None], point, jnp.nan)
+    point = contact_of(snapshots.qpos, snapshots.reading.p_robot_contact)
+    return jnp.where((snapshots.reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
 def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
@@ -241,7 +237,7 @@ def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
         **dict.fromkeys(("steps", "contact_steps", "lost_steps"), count),
         **dict.fromkeys(("absent_steps", "repositions"), count),
         **dict.fromkeys(("done", "success", "tipped", "diverged", "nan_twist"), false),
-        drive=None if world.robot is None else drive.init_drive(world.qpos),
+        drive=None if world.robot is None else base.init_drive(world.qpos),
         load=base.init_load(world.qpos) if law.senses == "force" else None,
         task=world.task.start(),
     )
@@ -264,9 +260,12 @@ def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
     return fp.place(world.footprint, p_robot_object, object_yaw - yaw)
 
 
-def contact_of(qpos: Float[Array, "10"], p_robot_contact: Vector) -> Vector:
+def contact_of(
+    qpos: Float[Array, "*B 10"], p_robot_contact: Float[Array, "*B 2"]
+) -> Float[Array, "*B 2"]:
     """Return a contact point in the world [m]."""
-    return qpos[JOINTS.base_position] + planar.rotate(qpos[JOINTS.base_yaw], p_robot_contact)
+    position, yaw = qpos[..., JOINTS.base_position], qpos[..., JOINTS.base_yaw]
+    return position + planar.rotate(yaw, p_robot_contact)
 
 
 def positions_of(
@@ -361,22 +360,22 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     """
     if trial.twists.shape[0]:
         twists, delayed = base.delay_twist(world.odometry, trial.twists, jnp.stack(twist), period)
-        delayed = drive.apply_errors(world.robot, delayed, world.odometry.velocity_error)
+        delayed = base.apply_errors(world.robot, delayed, world.odometry.velocity_error)
         trial, twist = trial._replace(twists=twists), Twist(*delayed)
     if world.robot is None or trial.drive is None:
         return trial, twist
-    aim = drive.aim(world.robot, trial.drive.aim, jnp.stack(twist), period)
+    aim = base.aim(world.robot, trial.drive.aim, jnp.stack(twist), period)
     trial = trial._replace(drive=trial.drive._replace(aim=aim))
-    return trial, Twist(*drive.apply_slip(world.robot, aim))
+    return trial, Twist(*base.apply_slip(world.robot, aim))
 
 
 def perceive(
     world: World, params: LawParams, trial: Trial, loop: ControlLoop
-) -> tuple[Trial, Measurement, Any]:
+) -> tuple[Trial, Measurement, Pytree]:
     """Sense and judge; return the trial, the readings, and the observation of the law."""
     law = loop.law
     judged, measured = observe(world, params, trial, loop)
-    obs: Any = measured.observation
+    obs: Pytree = measured.observation
     if law.heading and obs.yaw_target is None:
         obs = obs._replace(yaw_target=planar.direction(obs.p_world_target))
     if not law.smooth:
@@ -430,7 +429,7 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
     state = decided.drive
     if world.robot is not None and state is not None:
         state = state if integral is None else state._replace(integral=integral)
-        state = drive.count_stalled_steps(world.robot, state, qvel)
+        state = base.count_stalled_steps(world.robot, state, qvel)
     way = planar.norm(qpos[xy] - decided.qpos[xy])
     moved = decided._replace(
         qpos=qpos,
@@ -453,7 +452,7 @@ def control_step(
     params: LawParams,
     trials: Trial,
     loop: ControlLoop,
-    mapped: Callable[..., Any] = jax.vmap,
+    mapped: Callable[..., Pytree] = jax.vmap,
 ) -> tuple[Trial, Snapshot]:
     """Run one control step of a batch of worlds; trials that have ended do not change.
 
@@ -468,9 +467,9 @@ def _solved_step(
     params: LawParams,
     trials: Trial,
     loop: ControlLoop,
-    mapped: Callable[..., Any],
-    solutions: Any,
-) -> tuple[tuple[Trial, Snapshot], Any]:
+    mapped: Callable[..., Pytree],
+    solutions: Pytree,
+) -> tuple[tuple[Trial, Snapshot], Pytree]:
     """Run `control_step` with the solutions of `ControlPeriod`; return also those of `Driven`."""
     decided, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
     force = trials.load is not None
@@ -488,9 +487,9 @@ def unroll(
     trials: Trial,
     loop: ControlLoop,
     steps: int,
-    mapped: Callable[..., Any] = jax.vmap,
+    mapped: Callable[..., Pytree] = jax.vmap,
     states: bool = False,
-) -> tuple[Trial, Any]:
+) -> tuple[Trial, Pytree]:
     """Run `steps` control steps of a batch; return also snapshots (steps, B, ...).
 
     With `states`, these are pairs of a snapshot and the state after the step. In reverse mode it
@@ -498,11 +497,13 @@ def unroll(
     `native.mapped`, derivatives are fastest.
     """
 
-    def output(stepped: tuple[Trial, Snapshot]) -> tuple[Trial, Any]:
+    def output(stepped: tuple[Trial, Snapshot]) -> tuple[Trial, Pytree]:
         trials, snapshots = stepped
         return trials, (snapshots, trials) if states else snapshots
 
-    def single(trial: Trial, inputs: Any, solutions: Any) -> tuple[tuple[Trial, Any], Any]:
+    def single(
+        trial: Trial, inputs: Pytree, solutions: Pytree
+    ) -> tuple[tuple[Trial, Pytree], Pytree]:
         """Run one control step of one world."""
         world, params, rules = inputs
         world_loop = dataclasses.replace(loop, rules=rules)
@@ -516,7 +517,7 @@ def unroll(
 
     # Without a checkpoint, XLA would store all intermediate numbers.
     @partial(jax.checkpoint, prevent_cse=False)
-    def step(trials: Trial, _: None) -> tuple[Trial, Any]:
+    def step(trials: Trial, _: None) -> tuple[Trial, Pytree]:
         return output(control_step(stage, worlds, params, trials, loop, mapped))
 
     return jax.lax.scan(step, trials, length=steps)
@@ -528,7 +529,7 @@ class SingleWorld(NamedTuple):
     native = False
     stage: Stage
 
-    def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
+    def drive(self, fields: Pytree, motion: Motion, period: ControlPeriod) -> Driven:
         """Step one world for one control period: see `Stage.drive`."""
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], (fields, motion, period))
         return jax.tree.map(lambda x: x[0], self.stage.drive(*batch))
@@ -573,7 +574,7 @@ def outcome(trial: Trial, worlds: World, loop: ControlLoop) -> Outcome:
         tipped=trial.tipped,
         diverged=trial.diverged,
         nan_twist=trial.nan_twist,
-        stalled=drive.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
+        stalled=base.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
         unfelt=trial.done & is_lost & jax.vmap(is_pressed)(worlds, trial.qpos),
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
@@ -610,7 +611,7 @@ def advance(
         return _advance_in_xla(batches, loop, steps)
 
     def single(
-        stage: Stage, world: World, params: LawParams, trial: Trial, rules: Any, steps: jax.Array
+        stage: Stage, world: World, params: LawParams, trial: Trial, rules: Pytree, steps: jax.Array
     ) -> Trial:
         """Advance one world."""
         world_loop = dataclasses.replace(loop, rules=rules)
@@ -622,13 +623,15 @@ def advance(
 
         return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, step, (0, trial))[1]
 
-    def in_xla(*inputs: Any) -> tuple[Trial, ...]:  # (worlds, params, trials, rules, steps) of each
+    def in_xla(
+        *inputs: Pytree,
+    ) -> tuple[Trial, ...]:  # (worlds, params, trials, rules, steps) of each
         """Advance all batches where the native compiler is not used."""
         rules, steps = jax.tree.map(lambda x: x[0], inputs[0][-2:])
         shared, pairs = dataclasses.replace(loop, rules=rules), zip(stages, inputs, strict=True)
         return _advance_in_xla([(stage, *values[:-2]) for stage, values in pairs], shared, steps)
 
-    def phase(world: World, params: LawParams, trial: Trial, *_: Any) -> jax.Array:
+    def phase(world: World, params: LawParams, trial: Trial, *_: Pytree) -> jax.Array:
         """Return 0 for trials that push, 1 for those before the first touch, above for ended."""
         return 2 * trial.done + (trial.contact_steps == 0)
 
@@ -643,8 +646,8 @@ def advance(
 class SegmentState(NamedTuple):
     """State of a batch of trials after a segment."""
 
-    steps: Any  # (B,) int: control steps of each trial in this segment
-    done: Any  # (B,) bool
+    steps: Pytree  # (B,) int: control steps of each trial in this segment
+    done: Pytree  # (B,) bool
     outcome: Outcome  # (B, ...)
 
 
@@ -717,7 +720,7 @@ compiled_outcome = jax.jit(outcome)
 
 
 def run_on_host(
-    engine: Engine, stage: Any, worlds: World, params: LawParams, loop: ControlLoop, threads: int
+    engine: Engine, stage: Pytree, worlds: World, params: LawParams, loop: ControlLoop, threads: int
 ) -> Iterator[Trial]:
     """Run a batch of worlds to their ends with an engine that JAX does not trace.
 

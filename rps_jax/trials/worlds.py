@@ -1,24 +1,105 @@
-"""Builders of worlds: of any solids, of draws, and their scenes for pictures."""
+"""Worlds of trials: from solids, draws and candidates, and the jobs that run them.
 
-from typing import Any
+A `WorldBatch` has some worlds with law parameters; a `Job` has those that one program can step.
+`Candidates` are law parameters with leaves (P, ...) in random worlds. A probe is one candidate at
+given points: `Candidates(params, [domain], 0, np.arange(n), points)`. A planner sets `per_world`
+and gives leaves (P, W, ...), its own parameters for each world.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypedDict, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
+from rps_jax.control import registry
+from rps_jax.control.base import Law, LawParams
 from rps_jax.geometry import solid
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
-from rps_jax.trials.jobs import WorldBatch
+from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Shift, World
+from rps_jax.trials.trial import Outcome, Shift, World
+from rps_jax.world import points as points_
 from rps_jax.world import scene
 from rps_jax.world.domain import RANDOM, Domain, Owner, Range, quantities_of
 from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
+from rps_jax.world.points import Points
 from rps_jax.world.scene import JOINTS, Friction, Scene, WorldInputs
+
+Tree = TypeVar("Tree")  # a pytree
+Inputs = tuple[World, LawParams]
+Collect = Callable[[np.ndarray, Outcome], object]  # indices (m,) of trials and their outcomes
+
+
+class BatchSize(TypedDict, total=False):
+    """Resources of functions that run trials."""
+
+    slots: int | None  # worlds that one worker steps at once on each device of the host
+    workers: int | None  # host threads for each device
+
+
+class BatchOptions(BatchSize, total=False):
+    """Keyword arguments of functions that run trials."""
+
+    callback: ProgressCallback
+
+
+def rows(tree: Tree, index: Any) -> Tree:
+    """Return the rows `index` of every leaf; an index is whatever arrays take."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+class WorldBatch(NamedTuple):
+    """Worlds and law parameters of some trials of a job."""
+
+    indices: np.ndarray  # (n,) indices of the trials in the run
+    worlds: World  # leaves (n, ...), on the host
+    stage: Pytree  # a `Stage`, or the models of an engine outside of JAX
+    params: Pytree = ()  # `LawParams` with leaves (n, ...), on the host; () if not yet known
+
+    def with_params(self, params: LawParams) -> WorldBatch:
+        """Return the trials with the same law parameters in every world."""
+        count, dtype = self.indices.size, jnp.result_type(float)
+        same = jax.tree.map(lambda x: np.full((count, *np.shape(x)), x, dtype), params)
+        return self._replace(params=same)
+
+    @property
+    def law(self) -> Law:
+        """Law of the parameters."""
+        return registry.law_of(self.params)
+
+    @property
+    def inputs(self) -> Inputs:
+        """Inputs of the program, which differ from trial to trial."""
+        return self.worlds, self.params
+
+    def split(self, count: int) -> tuple[WorldBatch, WorldBatch | None]:
+        """Return the first `count` trials, and the rest if there is one."""
+        arrays = self._replace(stage=None)
+        parts = slice(count), slice(count, None)
+        first, rest = (rows(arrays, part)._replace(stage=self.stage) for part in parts)
+        return first, rest if rest.indices.size else None
+
+
+class Job(NamedTuple):
+    """Trials that one compiled program can step."""
+
+    program: Hashable  # key of the program; jobs with equal keys can be joined
+    num_trials: int  # at most; there are no more slots than that
+    batches: Iterable[WorldBatch]  # of one law, and of one stage if JAX traces the engine
+
+
+# --- builders ----------------------------------------------------------------------------------
 
 
 def build(indices: np.ndarray, inputs: WorldInputs, setting: Setting, **fields: Any) -> WorldBatch:
@@ -121,3 +202,76 @@ def drawn_scene(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
         return scene.compile_row(drawn.inputs(domain, physics), i)
     ground, robot = (float(leaf[i]) for leaf in drawn.friction)
     return scene.load(name, physics, Friction(ground, robot), robot=domain.robot)
+
+
+# --- candidates --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Parameters of one law, and the W worlds of each of D domains that the P candidates meet."""
+
+    params: LawParams  # leaves (P, ...); (P, D * W, ...) with `per_world`
+    domains: Sequence[Domain]
+    seed: int  # of the worlds
+    worlds: np.ndarray  # (W,) indices of the worlds, in each of the domains
+    points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn worlds
+    per_world: bool = False  # whether a candidate has different parameters in each world
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (P, D * W) of the outcomes."""
+        num_candidates = jax.tree.leaves(self.params)[0].shape[0]
+        return num_candidates, len(self.domains) * self.worlds.size
+
+    @functools.cached_property
+    def draws(self) -> list[tuple[np.ndarray, Domain, Draw]]:
+        """Worlds by domain and object: positions (n,) among all D * W, domain and draw."""
+        return [
+            (i * self.worlds.size + at, domain, drawn)
+            for i, domain in enumerate(self.domains)
+            for at, drawn in points_.draw_by_object(domain, self.seed, self.points, self.worlds)
+        ]
+
+    @property
+    def distances(self) -> np.ndarray:
+        """Distances (D * W,) [m] from the start to the target."""
+        distances = np.empty(self.shape[1])
+        for columns, _, drawn in self.draws:
+            distances[columns] = np.linalg.norm(drawn.p_world_target, axis=1)
+        return distances
+
+    def batches(self, setting: Setting) -> Iterator[WorldBatch]:
+        """Yield the worlds by domain and object, without law parameters.
+
+        The indices (n,) of a batch are the positions of its worlds among all D * W.
+        """
+        # Odometry of equal length in all domains lets their worlds share a batch.
+        period = setting.physics.control_period
+        remembered = max(remembered_steps(domain, period) for domain in self.domains)
+        for columns, domain, drawn in self.draws:
+            worlds = drawn_worlds(domain, drawn, setting, remembered)
+            yield worlds._replace(indices=columns)
+
+    def jobs(self, setting: Setting) -> Iterator[Job]:
+        """Yield the worlds of each domain and object, candidate after candidate."""
+        num_candidates, width = self.shape
+        params, dtype = jax.device_get(self.params), jnp.result_type(float)
+
+        def candidate(worlds: WorldBatch, i: int) -> WorldBatch:
+            trials = worlds._replace(indices=width * i + worlds.indices)
+            if not self.per_world:
+                return trials.with_params(rows(params, i))
+            chosen = rows(params, (i, worlds.indices))
+            return trials._replace(params=jax.tree.map(lambda x: np.asarray(x, dtype), chosen))
+
+        for worlds in self.batches(setting):
+            batches = [candidate(worlds, i) for i in range(num_candidates)]
+            program = _shape_key(batches[0].inputs)
+            yield Job(program, num_candidates * worlds.indices.size, batches)
+
+
+def _shape_key(tree: object) -> Hashable:
+    """Return the structure of a pytree and the shapes of its leaves without their first axis."""
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, *(np.shape(leaf)[1:] for leaf in leaves)

@@ -30,8 +30,8 @@ from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Pair
 from rps_jax.trials import trial
 from rps_jax.trials.env import PushEnv, State
-from rps_jax.trials.jobs import rows
 from rps_jax.trials.trial import World
+from rps_jax.trials.worlds import rows
 from rps_jax.tuning import ppo as ppo_
 from rps_jax.tuning.ppo import PPO, Privileged, TrainState, Transition
 from rps_jax.world.scene import JOINTS
@@ -253,7 +253,7 @@ def _act_together(
 
         carry = batch.states, touch_state, jnp.zeros_like(batch.earned)
         steps = round(network.hold / env.dt)
-        (state, touch_state, reward), _ = jax.lax.scan(step, carry, length=steps)
+        state, touch_state, reward = jax.lax.scan(step, carry, length=steps)[0]
         memory = batch.memory._replace(
             touch_state=touch_state, hidden=jnp.zeros(()), action=bounded
         )

@@ -37,13 +37,13 @@ from rps_jax.record.options import check_arguments
 from rps_jax.robot import base
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import Reading
-from rps_jax.trials import jobs, trial
+from rps_jax.trials import trial
 from rps_jax.trials.results import WORLD, labelled
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trajectory import control_loop, count_steps
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
-from rps_jax.trials.worlds import drawn_worlds, soften_skins
+from rps_jax.trials.worlds import drawn_worlds, rows, soften_skins
 from rps_jax.tuning import gradients
 from rps_jax.world import draws, points
 from rps_jax.world.domain import (
@@ -539,7 +539,7 @@ def _moved_scores(
         for slot, (i, k) in enumerate(chunk):
             for name, slope in slopes[k].items():
                 moved[name][(slot, *coordinates[k].leaf_index[1:])] += change[i, k] * slope[i]
-        (values, _), _ = jax.device_get(run(jobs.rows(inputs, index), moved))
+        (values, _), _ = jax.device_get(run(rows(inputs, index), moved))
         scores[tuple(chunk.T)] = values[: len(chunk)]
     return scores
 

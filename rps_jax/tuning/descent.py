@@ -39,10 +39,9 @@ from rps_jax.geometry.arrays import Number
 from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
 from rps_jax.trials import trial
-from rps_jax.trials.jobs import rows
 from rps_jax.trials.trajectory import control_loop
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
-from rps_jax.trials.worlds import soften_skins
+from rps_jax.trials.worlds import rows, soften_skins
 from rps_jax.tuning import gradients
 from rps_jax.tuning.derivatives import soft_times
 from rps_jax.tuning.evolution import Descent, gradient_results

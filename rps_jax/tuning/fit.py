@@ -52,11 +52,10 @@ from rps_jax.runs.question import (
     call_of,
 )
 from rps_jax.trials import trial
-from rps_jax.trials.jobs import rows
 from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import ControlLoop, Trial, World, object_pose
-from rps_jax.trials.worlds import drawn_worlds
+from rps_jax.trials.worlds import drawn_worlds, rows
 from rps_jax.tuning import logs as logs_
 from rps_jax.tuning import posterior
 from rps_jax.tuning.logs import Log, RawLog

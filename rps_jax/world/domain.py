@@ -18,7 +18,7 @@ from rps_jax.record.folder import describe_difference
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.robot import LATENCIES, Robot, RobotLike, parse_robot
-from rps_jax.world import paper, scene, streams, tasks
+from rps_jax.world import paper, scene, tasks
 from rps_jax.world.objects import (
     FAMILIES,
     PAPER_OBJECTS,
@@ -28,11 +28,13 @@ from rps_jax.world.objects import (
     text_of,
 )
 from rps_jax.world.quantity import (
+    COLUMNS,
     Owner,
     Quantity,
     Range,
     check_ranges,
     check_unused,
+    claim,
     declared,
     numbers_of,
     range_of,
@@ -383,14 +385,14 @@ UNRANGED = (
     "feet_number",
     "feet_turn",
 )
-streams.claim("a domain", *(x.name for x in fields(Domain)), *VELOCITY_ERRORS)
-streams.claim("an object", *UNRANGED, "object", "corners")
+claim("a domain", *(x.name for x in fields(Domain)), *VELOCITY_ERRORS)
+claim("an object", *UNRANGED, "object", "corners")
 
 
 def number_names() -> tuple[str, ...]:
     """Return the names of the random numbers of a world: the old ones by column, then by name."""
     current = {*numbers_of(QUANTITIES), *UNRANGED, *tasks.UNRANGED}
-    return (*streams.COLUMNS, *sorted(current - streams.COLUMNS.keys()))
+    return (*COLUMNS, *sorted(current - COLUMNS.keys()))
 
 
 def unit_of(name: str) -> str:
@@ -576,7 +578,7 @@ def from_json(values: JsonObject) -> Domain:
     return domain
 
 
-def _from_json(values: Mapping[str, Any], base: Domain) -> dict[str, Any]:
+def _from_json(values: Mapping[str, object], base: Domain) -> dict[str, Any]:
     """Return fields of a domain; a range without a scale has that of the `base` domain."""
     parsed = {}
     known = [f.name for f in fields(Domain)]

@@ -16,7 +16,8 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.solid import GRAVITY, SIDES, Solid
 from rps_jax.record.files import Arrays
 from rps_jax.robot.robot import Robot
-from rps_jax.world import scene, streams
+from rps_jax.world import quantity as quantities
+from rps_jax.world import scene
 from rps_jax.world.domain import (
     QUANTITIES,
     RANDOM,
@@ -63,7 +64,7 @@ def draw(
 
 def numbers(seed: int, index: np.ndarray) -> Arrays:
     """Return the random numbers (n,) in [0, 1) of the worlds `index` (n,), by name."""
-    return streams.numbers(seed, index, number_names())
+    return quantities.numbers(seed, index, number_names())
 
 
 def draw_at(

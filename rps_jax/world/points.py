@@ -133,7 +133,7 @@ class Points:
         return points
 
 
-def check_points(domain: Domain, u: Any) -> Points:
+def check_points(domain: Domain, u: object) -> Points:
     """Return the points of an array (n, q) or of a dataset of `worlds_at`; or InputError."""
     expected = names(domain)
     if isinstance(u, xr.Dataset):
@@ -279,7 +279,7 @@ def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
     quantities, kinds, ranges, units = map(list, zip(*coordinates(domain), strict=True))
     low, high, log = map(list, zip(*ranges, strict=True))
     columns = {"low": low, "high": high, "log": np.array(log, np.int8), "unit": units}
-    coords: dict[str, Any] = {
+    coords: dict[str, object] = {
         name: ("quantity", values) for name, values in (columns | {"kind": kinds}).items()
     }
     coords |= {"quantity": quantities, "world": np.arange(len(u))}

@@ -7,8 +7,8 @@ from rps_jax import errors
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import CapacitiveSkin
-from rps_jax.world import domain, streams, tasks
-from rps_jax.world.quantity import Quantity, declared
+from rps_jax.world import domain, tasks
+from rps_jax.world.quantity import Quantity, claim, declared
 from rps_jax.world.tasks.base import Task
 
 
@@ -35,7 +35,7 @@ def register_quantity(name: str, quantity: Quantity) -> None:
       Range(low=0.1, high=0.5, log=False)
     """
     known = domain.QUANTITIES.get(name)
-    streams.claim("a custom quantity", name)
+    claim("a custom quantity", name)
     if known is not None and replace(known, apply=quantity.apply) != quantity:
         rule = f"it is registered as {known}; choose another name"
         raise errors.not_allowed("name of a quantity", name, rule)

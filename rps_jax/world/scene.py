@@ -15,7 +15,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
 from rps_jax.record.files import Arrays
-from rps_jax.robot.drive import GRIP
+from rps_jax.robot.base import GRIP
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Shell
 from rps_jax.world import objects
@@ -118,8 +118,6 @@ class Joints(NamedTuple):
     base_yaw: int = 2
     object_height: int = 5
     object_quaternion: slice = slice(6, 10)
-    # Of qvel alone:
-    object_yaw_rate: int = 8
 
 
 JOINTS = Joints()
@@ -374,9 +372,7 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
     base.inertia[:] = float(robot.inertia)  # about the other axes it never turns
     for joint in base.joints:
         joint.armature = 0.0
-    if (
-        robot.drive != "omni"
-    ):  # the engine sets its coefficients, the direction of `Tyres`, in steps
+    if robot.drive != "omni":  # the engine sets the coefficients, the direction of `Tyres`
         tyres = spec.add_tendon(name="tyres", armature=GRIP * float(robot.mass))
         for joint, coefficient in zip(base.joints, (0.0, 1.0, 0.0), strict=True):
             tyres.wrap_joint(joint.name, coefficient)
@@ -476,8 +472,6 @@ def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarra
     reach = np.max(math.sin(yaw) * y - math.cos(yaw) * x) + float(scene.footprint.radius)
     qpos = scene.physics.qpos0.copy()
     qpos[JOINTS.base] = 0.0
-    height = qpos[JOINTS.object][2]
-    front = float(scene.shell.half[0])
-    position = [front + gap + reach, 0.0, height]
+    position = [float(scene.shell.half[0]) + gap + reach, 0.0, qpos[JOINTS.object_height]]
     qpos[JOINTS.object] = [*position, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
     return qpos

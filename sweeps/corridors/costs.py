@@ -21,8 +21,9 @@ import xarray as xr
 from rps_jax import Domain, Rules, Setting
 from rps_jax.laws import resolve_law
 from rps_jax.questions import Run, call_of, option
-from rps_jax.trials.batch_run import Candidates, outcomes
+from rps_jax.trials.batch import outcomes
 from rps_jax.trials.progress import Progress
+from rps_jax.trials.worlds import Candidates
 from rps_jax.worlds import parse_domain
 from sweeps.study_base import SpeedStudy, Table
 

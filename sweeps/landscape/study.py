@@ -21,9 +21,10 @@ from rps_jax import Domain, RPSParams, errors
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.laws import law_of
 from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
-from rps_jax.trials.batch_run import Candidates, outcomes
+from rps_jax.trials.batch import outcomes
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.trial import Outcome
+from rps_jax.trials.worlds import Candidates
 from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.landscape.candidates import aims, cloud, front_table, lines, undominated
 

@@ -18,10 +18,11 @@ from rps_jax.laws import LawParams
 from rps_jax.physics import FRICTION, PHYSICS
 from rps_jax.questions import Run
 from rps_jax.trials import pushes
-from rps_jax.trials.batch_run import Candidates, outcomes
+from rps_jax.trials.batch import outcomes
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.trial import Outcome
+from rps_jax.trials.worlds import Candidates
 from rps_jax.world import paper, points, scene
 from rps_jax.worlds import parse_domain
 from sweeps.paper_reading import printed

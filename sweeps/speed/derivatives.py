@@ -26,9 +26,8 @@ from rps_jax.control import registry
 from rps_jax.engines import native
 from rps_jax.laws import law_of
 from rps_jax.questions import Run, call_of, option
-from rps_jax.trials.batch_run import Candidates
 from rps_jax.trials.trial import ControlLoop, advance, start_all, unroll
-from rps_jax.trials.worlds import soften_skins
+from rps_jax.trials.worlds import Candidates, soften_skins
 from rps_jax.worlds import parse_domain
 from sweeps.speed.study import best
 from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table

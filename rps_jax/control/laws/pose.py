@@ -454,11 +454,13 @@ def step(
         drive = jnp.stack([v_drive, jnp.zeros_like(v_drive)])
         spin = jnp.where(arrives, 2 * face, jnp.where(is_large, jnp.sign(error) * jnp.pi, error))
     spin = jnp.where(mode == BACK, 0.0, jnp.clip(spin, -params.omega_free, params.omega_free))
-    free = Twist(*jnp.where(mode == BACK, flee, drive), spin), params.v_free, params.omega_free
+    free_x, free_y = jnp.where(mode == BACK, flee, drive)
+    free = Twist(free_x, free_y, spin), params.v_free, params.omega_free
     push = Twist(v, v_y, omega), params.v_max, params.omega_max
-    twist, *bounds = soft.tree_where(mode == PUSH, push, free)
+    twist, v_max, omega_max = soft.tree_where(mode == PUSH, push, free)
     v, v_y, omega = (jnp.where(done, 0.0, x) for x in twist)
-    twist = Twist(v, v_y if omni else v_y + axle * omega, omega).saturate(*bounds)
+    v_y = v_y if omni else v_y + axle * omega
+    twist = Twist(v, v_y, omega).saturate(v_max, omega_max)
     distance = planar.norm(jnp.stack([way_left, y]))
     details = Details(offset, distance, jnp.zeros_like(distance), face, mode != PUSH)
     memory = PoseState(

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class Policy(NamedTuple):
     network: Network
     weights: Weights  # float32, on the host
     task: LearnedParams = LearnedParams()
-    learned: Mapping[str, Any] = {}  # JSON: how the law was learned
+    learned: Mapping[str, object] = {}  # JSON: how the law was learned
 
 
 def encode(policy: Policy) -> bytes:

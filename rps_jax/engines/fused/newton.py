@@ -21,12 +21,12 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
 from rps_jax.engines.fused.contacts import Body, Contact, Point, State
-from rps_jax.engines.linear_map import restrict, varied_indices
+from rps_jax.engines.native import restrict, varied_indices
 from rps_jax.geometry import vectors as sp
-from rps_jax.geometry.arrays import Number
+from rps_jax.geometry.arrays import Number, Pytree
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.geometry.vectors import Vec
-from rps_jax.robot.drive import Tyres
+from rps_jax.robot.base import Tyres
 from rps_jax.world.physics import Physics
 
 SOLUTION = "accelerations"  # name of the solver's results, for policies of `jax.checkpoint`
@@ -63,8 +63,8 @@ def contact_force(contact: Contact, x: Row, physics: Physics) -> tuple[Row, Row]
     across = pull * f * f / slip
     stiffness, stuck = [nn, *(-nn * f * e for e in way)], [d, *(0.0 for _ in way)]
     for i, e in enumerate(way):
-        rest = [across * y * y for j, y in enumerate(way) if j != i]
-        stiffness += [along * e * e + reduce(sp.plus, rest)]
+        rest = (across * y * y for j, y in enumerate(way) if j != i)
+        stiffness += [reduce(sp.plus, rest, along * e * e)]
         stiffness += [(along - across) * e * y for y in way[i + 1 :]]
         stuck += [d_t, *(0.0 for _ in way[i + 1 :])]
     sticking = (-d * x[0], *(-d_t * y for y in x[1:])), tuple(stuck)
@@ -234,7 +234,7 @@ def accelerations(
         problem, solution = rebuilt(arrays)
         return _minimise(problem, physics) if solution is None else list(solution)
 
-    def rule(primals: Any, tangents: Any) -> tuple[list[Vec], list[Vec]]:
+    def rule(primals: Pytree, tangents: Pytree) -> tuple[list[Vec], list[Vec]]:
         (arrays,), (directions,) = primals, tangents
         x = checkpoint_name(run(arrays), SOLUTION)
 
@@ -321,8 +321,8 @@ def wrench_on_base(
     """
     force, _ = contact_force(contact, _at(contact, x), physics)
     f_x, f_y, torque = _sums(_on_base(arm, sp.combine(force, (contact.n, contact.t, contact.s))))
-    x, y = sp.turned_back(turn, (f_x, f_y))
-    return -x, -y, -torque  # the contacts' force is on the object
+    ahead, left = sp.turned_back(turn, (f_x, f_y))
+    return -ahead, -left, -torque  # the contacts' force is on the object
 
 
 def _sums(vector: Vec) -> Vec:

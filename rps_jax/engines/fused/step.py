@@ -9,15 +9,17 @@ a compiler can keep a whole world in registers.
 
 from __future__ import annotations
 
+import functools
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.ad_checkpoint import checkpoint_policies
 
-from rps_jax.engines import native
-from rps_jax.engines.base import ControlPeriod, Driven, Motion
+from rps_jax.engines import device, native
+from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
 from rps_jax.engines.fused.contacts import (
     Body,
     Corners,
@@ -29,13 +31,15 @@ from rps_jax.engines.fused.contacts import (
     on_wall,
 )
 from rps_jax.engines.fused.newton import SOLUTION, Base, Problem, accelerations, wrench_on_base
+from rps_jax.geometry import solid
 from rps_jax.geometry import vectors as sp
-from rps_jax.geometry.arrays import Entries
+from rps_jax.geometry.arrays import Entries, Pytree
 from rps_jax.geometry.vectors import Vec
-from rps_jax.robot import drive as drives
+from rps_jax.robot.base import Tyres, push
 from rps_jax.robot.robot import Robot
+from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS
+from rps_jax.world.scene import JOINTS, OFF_CENTRE, WorldInputs
 
 _SAVED = checkpoint_policies.save_only_these_names(SOLUTION)
 
@@ -111,11 +115,11 @@ def step(
     turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
     base = Base()
     if robot is not None and driven is not None:
-        force, integral = drives.push(robot, driven.integral, twist, driven.v, turn, dt)
+        force, integral = push(robot, driven.integral, twist, driven.v, turn, dt)
         if body.gravity is not None:
             force = sp.add(force, sp.scale(robot.mass, (*body.gravity[:2], 0.0)))
         is_omni = robot.drive == "omni"
-        tyres = None if is_omni else drives.Tyres.of(robot, driven.v, turn, dt)
+        tyres = None if is_omni else Tyres.of(robot, driven.v, turn, dt)
         base = Base((robot.mass, robot.mass, robot.inertia), force, tyres)
         driven = driven._replace(integral=integral)
     x = accelerations(Problem.of(body, state, m, contacts, base), physics, solution)
@@ -135,8 +139,15 @@ def step(
     sinc = 0.5 * (1 - half * half / 6)
     q = sp.times(state.q, (1 - half * half / 2 + half**4 / 24, *sp.scale(sinc, angle)))
     length = jax.lax.rsqrt(sp.dot(q, q))
-    velocity = (*sp.turned(turn, twist), twist[2]) if driven is None else driven.v
-    base = sp.add(state.base, sp.scale(dt, velocity))
+    if driven is None:
+        c, s = turn
+        base = (
+            state.base[0] + dt * (c * twist[0] - s * twist[1]),
+            state.base[1] + dt * (s * twist[0] + c * twist[1]),
+            state.base[2] + dt * twist[2],
+        )
+    else:
+        base = sp.add(state.base, sp.scale(dt, driven.v))
     p = sp.add(state.p, sp.scale(dt, v))
     q = tuple(x * length for x in q)
     return State(base, p, q, v, w, a, alpha, driven, wrench_sum)  # type: ignore[arg-type]
@@ -155,10 +166,10 @@ class FusedStage(NamedTuple):
         compiled, and so are the derivatives; elsewhere XLA compiles it.
         """
 
-        def steps(*inputs: Any) -> Driven:
+        def steps(*inputs: Pytree) -> Driven:
             return _drive(*inputs, physics=period.physics, force=period.force)
 
-        def with_solutions(inputs: Any, solutions: Any) -> tuple[Driven, Any]:
+        def with_solutions(inputs: Pytree, solutions: Pytree) -> tuple[Driven, Pytree]:
             driven = steps(*inputs, solutions)
             return driven._replace(solutions=None), driven.solutions
 
@@ -173,7 +184,7 @@ def _drive(
     motion: Motion,
     twist: Vec,
     robot: Robot | None,
-    solutions: Any = None,
+    solutions: Pytree = None,
     *,
     physics: Physics,
     force: bool,
@@ -220,3 +231,79 @@ def split_entries(body: Body) -> Body:
     if body.vertices.shape[-2] == 1:
         return Body(vertices=tuple(x[0] for x in corners), **entries)
     return Body(vertices=Corners.of(corners), **entries)
+
+
+# --- the engine ----------------------------------------------------------------------------------
+
+_MAX_ON_PROCESSORS = 500  # trials that processors finish sooner than a GPU
+
+
+class Fused(Engine):
+    """MJX's equations, specialised to these scenes: the fastest engine on every device."""
+
+    name = "fused"
+    side_by_side = True
+    modes = ("forward", "reverse")
+
+    def stage(self, inputs: WorldInputs) -> tuple[FusedStage, Body]:
+        """Return the stage, and the bodies (n, ...) of the worlds."""
+        solids, (friction, physics, robots) = inputs.solids, inputs[2:5]
+        com, axes = solids.p_object_com + OFF_CENTRE, solid.axes(solids)
+        base_invweight, base_z = _base(physics)
+        if robots.driven:
+            base_invweight = scene.base_invweight(robots)
+
+        def lower(points: np.ndarray) -> np.ndarray:
+            """Return points (n, N, 2) of the lower face in the body's frame."""
+            z = np.broadcast_to(-solids.height[:, None, None] / 2, (*points.shape[:2], 1))
+            return (np.concatenate([points, z], axis=-1) - com[:, None]) @ axes
+
+        bodies = Body(
+            mass=solids.mass,
+            inertia=solids.inertia,
+            p_object_com=com,
+            q_object_body=solids.q_object_body,
+            vertices=lower(solids.vertices),
+            radius=solids.radius,
+            height=solids.height,
+            up=axes[:, 2],
+            friction_ground=friction.ground,
+            friction_robot=friction.robot,
+            invweight=1 / solids.mass,
+            base_invweight=np.broadcast_to(base_invweight, solids.mass.size),
+            base_size=scene.base_size(robots, solids.mass.size),
+            base_z=np.broadcast_to(base_z, (solids.mass.size, 2)),
+            gravity=inputs.surroundings.slope,
+            boundary=inputs.surroundings.boundary,
+        )
+        if solids.feet is not None:
+            feet = lower(solids.feet[..., :2])
+            weights = solids.feet[..., 2:]
+            weights = np.sign(weights) if solids.pads is None else weights
+            bodies = bodies._replace(feet=feet, foot_weight=weights, pads=solids.pads)
+        around = inputs.surroundings
+        if around.walls is not None:
+            ends = around.walls.reshape(inputs.num_worlds, -1, 4)
+            bodies = bodies._replace(walls=ends, friction_wall=around.friction_wall)
+        return FusedStage(), bodies
+
+    def slots(self, backend: str) -> int:
+        """Return the number of worlds that one worker steps at once."""
+        return 64 if backend == "cpu" else 32768
+
+    def suits_processors(self, trials: int | None) -> bool:
+        """Whether there are few trials and a C compiler: a GPU takes some 5 s to start."""
+        few = trials is not None and trials <= _MAX_ON_PROCESSORS
+        return few and device.find_compiler() is not None
+
+
+@functools.cache
+def _base(physics: Physics) -> tuple[float, np.ndarray]:
+    """Return the inverse weight [1/kg] of the base, and the heights (2,) [m] of its edges."""
+    model = scene.load("box", physics).physics
+    body, geom = model.body("base"), model.geom("base")
+    z = geom.pos[2] + geom.size[2] * np.array([-1.0, 1.0])
+    return model.body_invweight0[body.id, 0], z
+
+
+ENGINE = Fused()

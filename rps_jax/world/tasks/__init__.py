@@ -17,8 +17,7 @@ from rps_jax.record.files import JsonObject
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import field_types, parse_changes
 from rps_jax.spec import Spec
-from rps_jax.world import streams
-from rps_jax.world.quantity import Quantity, declared, numbers_of, range_of
+from rps_jax.world.quantity import Quantity, claim, declared, numbers_of, range_of
 from rps_jax.world.tasks.base import Task
 
 TASKS: dict[str, type[Task]] = {}  # by name
@@ -34,12 +33,12 @@ def add(task: type[Task]) -> None:
     names = {*numbers_of(quantities), *task.NUMBERS}
     for name in {*quantities, *names}:  # the first class that declares it owns it
         owner = next(x for x in reversed(task.__mro__) if name in _names_of(x))
-        streams.claim(f"the task {getattr(owner, 'kind', '') or owner.__name__}", name)
+        claim(f"the task {getattr(owner, 'kind', '') or owner.__name__}", name)
         new = quantities.get(name)
         if owner is not task and new is not None and QUANTITIES.get(name, new) != new:
             rule = f"{owner.__name__} declares it as {QUANTITIES[name]}; choose another name"
             raise errors.not_allowed(f"quantity of the task {task.kind}", name, rule)
-    streams.claim("an outcome of tasks", *task.OUTCOMES)
+    claim("an outcome of tasks", *task.OUTCOMES)
     for name, outcome in task.OUTCOMES.items():
         if OUTCOMES.get(name, outcome) != outcome:
             rule = f"another task has it as {OUTCOMES[name]}; choose another name"

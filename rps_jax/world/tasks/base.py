@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.geometry.arrays import Array, Bool, Float, Floats, Scalar, Vector
+from rps_jax.geometry.arrays import Array, Bool, Float, Floats, Pytree, Scalar, Vector
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import check_fields
@@ -52,18 +52,18 @@ class Aim(NamedTuple):
 class Course(Protocol):
     """Parameters of a task in one world: a pytree."""
 
-    def start(self) -> Any:
+    def start(self) -> Pytree:
         """Return the progress before the first control step.
 
         It is a pytree, whose `outcomes()` are those of `Task.OUTCOMES`, batched or not.
         """
         ...
 
-    def step(self, progress: Any, positions: Positions) -> tuple[Any, Aim]:
+    def step(self, progress: Pytree, positions: Positions) -> tuple[Pytree, Aim]:
         """Return the progress after one control step, and the aim."""
         ...
 
-    def remaining(self, progress: Any, p_world_goal: Array, point: Array) -> Array:
+    def remaining(self, progress: Pytree, p_world_goal: Array, point: Array) -> Array:
         """Return the way [m] from a point (2,) [m] to the end, for rewards."""
         ...
 
@@ -163,10 +163,10 @@ class Task:
         `object_width` loads models.
         """
 
-    def measures(self, course: Any) -> Arrays:
+    def measures(self, course: object) -> Arrays:
         """Return quantities (n,) of courses that the drawn numbers do not tell, by name."""
         return {}
 
-    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Pytree]:
         """Return the ends (n, 2) [m] of trials, and the `Course` (n, ...) of n worlds."""
         raise NotImplementedError

@@ -20,7 +20,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar, polyline
-from rps_jax.geometry.arrays import Array, Entries, Float, Floats, Ints, namespace_of
+from rps_jax.geometry.arrays import Array, Entries, Float, Floats, Ints, Pytree, namespace_of
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.polyline import Polyline, distances
 from rps_jax.record.files import Arrays
@@ -177,7 +177,7 @@ def _where_due(due: Array, function: Callable[[Array, _T], _T], poses: Array, la
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _if_due(function: Callable[..., _T], due: Array, poses: Array, last: _T, inputs: Any) -> _T:
+def _if_due(function: Callable[..., _T], due: Array, poses: Array, last: _T, inputs: Pytree) -> _T:
     """Return `function(poses, last, *inputs)` if it is due, else `last`.
 
     It is a loop of at most one pass: a program for many worlds skips the pass if no world needs it.
@@ -192,8 +192,8 @@ def _if_due(function: Callable[..., _T], due: Array, poses: Array, last: _T, inp
 
 
 @_if_due.defjvp
-def _(function: Callable[..., _T], primals: Any, tangents: Any) -> tuple[_T, _T]:
-    def select(due: Array, poses: Array, last: _T, inputs: Any) -> _T:
+def _(function: Callable[..., _T], primals: Pytree, tangents: Pytree) -> tuple[_T, _T]:
+    def select(due: Array, poses: Array, last: _T, inputs: Pytree) -> _T:
         result = function(poses, last, *inputs)
         return jax.tree.map(partial(jnp.where, due), result, last)
 
@@ -295,7 +295,7 @@ class Corridor(Path):
                 rule = "a wall beside them crosses the base at its start; start them ahead"
                 raise errors.not_allowed("task waypoints", self.waypoints[:2], rule)
 
-    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Pytree]:
         """Return the ends, paths and walls of worlds."""
         targets, inner = super().courses(inputs)
         half = self.width.at(inputs.u["width"]) / 2

@@ -16,7 +16,7 @@ import scipy
 
 from rps_jax import errors
 from rps_jax.geometry import polyline, solid
-from rps_jax.geometry.arrays import Array, Entries, Floats, Int, namespace_of
+from rps_jax.geometry.arrays import Array, Entries, Floats, Int, Pytree, namespace_of
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.record.files import Arrays
 from rps_jax.robot.shell import Shell
@@ -191,7 +191,7 @@ class Path(Following):
             if is_bad:
                 raise errors.not_allowed("task waypoints", bad.tolist(), rule)
 
-    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Pytree]:
         """Return the ends and the paths of worlds."""
         vertices = self.vertices(inputs)
         lookahead: Any = self.lookahead.at(inputs.u["lookahead"])

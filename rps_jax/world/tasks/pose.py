@@ -141,13 +141,7 @@ class Pose(Task):
 
     heading: Annotated[
         Range,
-        Quantity(
-            "rad",
-            "heading of the last push",
-            ge=-_TURN,
-            le=_TURN,
-            owner="course",
-        ),
+        Quantity("rad", "heading of the last push", ge=-_TURN, le=_TURN, owner="course"),
     ] = Range(-math.pi, math.pi)
     d_success: Annotated[float, Spec("m", "greatest error of the place", gt=0, le=1)] = 0.05
     yaw_success: Annotated[float, Spec("rad", "greatest error of the heading", gt=0, le=3.2)] = 0.1

@@ -23,6 +23,7 @@ from PIL import Image
 
 from rps_jax import errors
 from rps_jax.geometry import polyline
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.geometry.polyline import Polyline, distances, is_inside, to_segment
 from rps_jax.record import files
 from rps_jax.record.options import option
@@ -149,7 +150,7 @@ class Rooms(Following):
             if polyline.clearance(shell.outline, walls)[0] <= 0:
                 raise errors.not_allowed("task start", start, "the base touches a wall there")
 
-    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Pytree]:
         """Return the ends, paths and walls of worlds."""
         route = np.floor(inputs.u["route"] * len(self._routes)).astype(int)
         starts = np.array(self.start)[route // len(self.goal)]
