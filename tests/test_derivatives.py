@@ -155,10 +155,10 @@ def test_the_results_are_labelled(results):
 def test_a_mass_without_influence_is_told(results):
     assert (slope(results, "mass") == 0).all()
     assert re.search("mass has no influence.*robot='kairos'.*domain='real'", results.notes)
-    notes = lambda name, domain, value=np.zeros((1, 2)): " ".join(  # noqa: E731
+    notes = lambda name, domain, value=np.zeros((1, 2)), engine="fused": " ".join(  # noqa: E731
         derivatives._notes(
             parse_domain(domain),
-            "fused",
+            engine,
             derivatives.coordinates_of(name, RPSParams(), TOUCHING),
             np.array([True]),
             value,
@@ -171,6 +171,7 @@ def test_a_mass_without_influence_is_told(results):
     assert not notes("mass", "real")
     assert not notes("friction_ground", "wide")
     assert "not finite in 1 of 2 trials" in notes("mass", "real", np.array([[1.0, np.nan]]))
+    assert "has not converged" in notes("friction_ground", "wide", engine="quasistatic")
 
 
 def test_a_kink_of_the_world_has_no_derivative_and_is_told():

@@ -218,9 +218,9 @@ def nested(registries):
 
     def step(params, state, observation):
         v = params.gains["v"] * jnp.sum(params.curve)
-        return state, Twist(v, 0 * v, 0 * v), Details.from_obs(observation)
+        return state, Twist(v, 0 * v, 0 * v), Details.from_obs(observation.touch)
 
-    law = Law(lambda params: (), step, check=lambda params: params)
+    law = Law(lambda params: (), step, "taxels", check=lambda params: params)
     registry.register_law("nested", law, Nested({"v": 0.01}, np.ones(3)))
 
 

@@ -375,19 +375,20 @@ class MineParams(NamedTuple):
 
 
 def mine_step(params, state, obs):
-    count, past = state
+    count, past, empty = state
     past = past.at[count % 5].set(obs.l)
     left, touches = obs.l > 0.01, obs.in_contact
     v_y = jnp.select([touches > left, touches], [-0.01, 0.01], 0.0)
     w = jnp.array([0.2, -0.2, 0.0])[jnp.argmax(jnp.stack([jnp.median(past) > 0, left, touches]))]
     w = w * jax.lax.cond(touches & (count % 3 == 0), lambda: 0.5, lambda: 1.0)
-    return (count + 1, past), Twist(params.v, v_y, w), Details.from_obs(obs)
+    return (count + 1, past, empty), Twist(params.v, v_y, w), Details.from_obs(obs)
 
 
 @pytest.fixture
 def mine(registries):
     """Register a custom law and return its parameters."""
-    law = Law(lambda params: (jnp.zeros((), jnp.int32), jnp.zeros(5)), mine_step)
+    state = jnp.zeros((), jnp.int32), jnp.zeros(5), jnp.zeros((2, 0))
+    law = Law(lambda params: state, mine_step)
     registry.register_law("mine", law, MineParams())
     return MineParams()
 

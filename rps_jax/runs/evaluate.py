@@ -98,8 +98,8 @@ def evaluate(
     at = None if points is None else points_.check_points(ranges, points)
     count = worlds if at is None else len(at.u)
     errors.check_count("worlds", count, at_most=10_000_000)
-    setting.check_domain(ranges, [params])
     params, seed = _checked(params), seed_of(setting.seed, split)
+    setting.check_domain(ranges, [batch.rows(params, 0)])
     request = Candidates(params, [ranges], seed, np.arange(count), at)
     cache.use_cache_if_requested()
     is_shown = is_interactive() if progress is None else progress

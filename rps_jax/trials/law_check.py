@@ -60,7 +60,7 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
         """Return arguments and results of the law in each control step (steps * worlds, ...)."""
         start = jax.vmap(functools.partial(trial.start, law=law))(worlds, params)
         records = jax.lax.scan(turn, start, length=_STEPS)[1]
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
+        return jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), records)
 
     def compare() -> str:
         arguments, expected = jax.jit(run)()

@@ -113,8 +113,7 @@ def value_and_grad(
     solution of each physics step. Where contacts, cones or rules switch they are one-sided, and
     jumps of the score are not in them. Pushes are chaotic: with time fewer gradients predict the
     effect of a small change. `useful` is the share of some worlds in which they do. Law and skin
-    have their smooth forms by default, so that what the law feels has derivatives. Where a step of
-    the engine quasistatic has not converged, they err by some 1e-3.
+    have their smooth forms by default, so that what the law feels has derivatives.
 
     Args:
       score: function of the `Trajectory` (T, ...) of one trial and of `args`, which returns one
@@ -177,7 +176,6 @@ def _gradients(
     Secants are those of a relative `change` of a quantity, one-sided or `central`.
     """
     i = SimpleNamespace(**inputs)
-    score, is_objective = i.score, isinstance(i.score, Objective)
     device.check_process()
     ranges = parse_domain(i.domain, i.robot, i.task)
     setting = i.setting.with_robot(ranges.robot)
@@ -192,18 +190,18 @@ def _gradients(
     if any(x != coordinates for x in others):
         rule = "parameters of wrt must have the same shapes and units in all laws"
         raise errors.not_allowed("laws", ", ".join(chosen), rule)
-    if is_objective and not all(hasattr(p, "v_max") for p in chosen.values()):
-        rule = "a law without a parameter v_max needs a function of the snapshots"
-        raise errors.not_allowed("score", "an Objective", rule)
-    if is_objective:
+    if isinstance(i.score, Objective):
+        if not all(hasattr(p, "v_max") for p in chosen.values()):
+            rule = "a law without a parameter v_max needs a function of the snapshots"
+            raise errors.not_allowed("score", "an Objective", rule)
         ranges.task.check_target("task", ranges.task, "give a function as score")
     cache.use_cache_if_requested()
     index, labels = np.arange(i.worlds), [x.label for x in coordinates]
     value, bend = np.empty((len(chosen), i.worlds)), np.empty((i.worlds, len(labels)))
     gradient = np.empty((*value.shape, len(labels)))
     secant, size = np.full_like(gradient, np.nan), np.ones_like(gradient)
-    tested, aux = list[np.ndarray](), [list[PyTree]() for _ in chosen]
-    options = _Options(score, steps, replace(setting, seed=0), i.has_aux, i.states)
+    aux = [list[PyTree]() for _ in chosen]
+    options = _Options(i.score, steps, replace(setting, seed=0), i.has_aux, i.states)
     used, temperature, order = np.zeros(len(labels), bool), 0.0, list[np.ndarray]()
     for at, drawn in points.draw_by_object(ranges, setting.world_seed, None, index):
         family = drawn_worlds(ranges, drawn, setting)
@@ -215,7 +213,6 @@ def _gradients(
         used |= list(map(bool, slopes))
         names, first = set(itertools.chain(*slopes)), at[:_TESTED]
         order.append(at)
-        tested.append(first)
         for law, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
             trees = {"world": family.worlds, "params": family.with_params(params).params}
             leaves = {name: x for name, x in named_leaves(trees).items() if name in names}
@@ -235,7 +232,8 @@ def _gradients(
     near = (
         np.abs(gradient - secant) <= 0.1 * np.abs(secant) + 3e-6 * np.abs(value)[..., None] / size
     )
-    useful = np.where(np.isnan(secant), np.nan, near)[:, np.concatenate(tested)].mean(axis=1)
+    useful = np.where(np.isnan(secant), np.nan, near)
+    useful = useful[:, np.concatenate([at[:_TESTED] for at in order])].mean(axis=1)
     useful[:, (bend > _MAX_BEND).any(axis=0)] = np.nan
     mean = gradients.estimate(jnp.asarray(gradient.swapaxes(0, 1)))
     dims, mean_dims = ("law", "world", "quantity"), ("law", "quantity")
@@ -262,7 +260,7 @@ def _gradients(
         _notes(ranges, setting.engine, coordinates, used, value, gradient, bend, useful)
     )
     if notes:
-        notes = f"Score {getattr(score, '__name__', 'objective')}: {notes}"
+        notes = f"Score {getattr(i.score, '__name__', 'objective')}: {notes}"
         warnings.warn(notes, stacklevel=4)
     attrs = provenance.attributes() | {
         "domain": name_or_custom(i.domain),
@@ -598,6 +596,8 @@ def _notes(
     """Yield sentences on coordinates whose derivatives are zero, not finite or of no use."""
     if invalid := np.sum(~np.isfinite(value)):
         yield f"The score is not finite in {invalid} of {value.size} trials."
+    if engine == "quasistatic":
+        yield "Gradients of quasistatic err by up to 1e-3 where a step has not converged."
     is_mass = np.array([x.name == "mass" and not x.is_parameter for x in coordinates])
     is_mass &= not domain.weakest.driven
     if is_mass.any():

@@ -29,9 +29,8 @@ class Estimate(NamedTuple):
 
 
 class Options(NamedTuple):
-    """Options of estimators; each uses some of them."""
+    """Options of `evolution`."""
 
-    clip: float = 2.0  # [1] bound on the norm of a sample, as a multiple of the median norm
     sigma: float | jax.Array = 0.15  # () or (p,) standard deviation of the steps, in theta's units
     pairs: int = 1  # antithetic pairs of steps in each world
 

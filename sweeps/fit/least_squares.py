@@ -13,7 +13,8 @@ is common to all windows.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -164,9 +165,15 @@ class Replay(NamedTuple):
         chunks = np.resize(u, (-(-len(u) // STARTS), STARTS, u.shape[1]))
         costs = np.concatenate([cost(self.derivatives(chunk)[0]) for chunk in chunks])
         u = chunks.reshape(-1, u.shape[1])[np.argsort(costs)[:STARTS]]
-        r, j = self.derivatives(u)
+        *_, last = itertools.islice(self.descend(u), _ITERATIONS + 1)
+        return last
+
+    def descend(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Yield the points (n, q) of iterations, their residuals, and the derivatives of these."""
+        u, (r, j) = u.copy(), self.derivatives(u)
         damping = np.full((len(u), 1), 1e-2)
-        for _ in range(_ITERATIONS):
+        while True:
+            yield u, r, j
             at, (g, h) = u[:, self.active], _expansion(r, j)
             fixed = ~self.periodic & (((at <= 0) & (g > 0)) | ((at >= _MAX_COORDINATE) & (g < 0)))
             diagonal = damping * (1 + np.diagonal(h, axis1=1, axis2=2)) + 1e12 * fixed
@@ -178,7 +185,6 @@ class Replay(NamedTuple):
             for old, changed in ((u, new), (r, r_new), (j, j_new)):
                 old[better] = changed[better]
             damping *= np.where(better, 0.2, 4.0)[:, None]
-        return u, r, j
 
     def derivatives(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (n, B, C) at points of one object, and derivatives (n, B, C, p).

@@ -10,10 +10,11 @@ and simulated trials.
 from __future__ import annotations
 
 import functools
+import itertools
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, ClassVar
@@ -210,25 +211,32 @@ def evolved(replay: Replay, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     The cost is that of `Replay.minima`, without derivatives. Also returns the residuals (1, B, C)
     at this point, and their derivatives (1, B, C, p) for its interval.
     """
-    values, active = _Values(*replay), replay.active
+    values = _Values(*replay)
     batches = np.resize(u, (-(-len(u) // _POPULATION), _POPULATION, u.shape[1]))
     costs = [least_squares.cost(values.derivatives(batch)[0]) for batch in batches]
     best = batches.reshape(-1, u.shape[1])[np.argmin(costs)]
-    least, u = np.min(costs), np.tile(best, (_POPULATION, 1))
+    *_, best = itertools.islice(evolve(replay, best, np.min(costs), len(batches)), _GENERATIONS)
+    u = np.tile(best, (least_squares.STARTS, 1))  # as many as `minima` compiles for
+    r, j = replay.derivatives(u)
+    return u[:1], r[:1], j[:1]
+
+
+def evolve(replay: Replay, best: np.ndarray, least: float, seed: int) -> Iterator[np.ndarray]:
+    """Yield the best point (q,) after each generation of CMA-ES, from one with the cost `least`."""
+    values, active = _Values(*replay), replay.active
+    u = np.tile(best, (_POPULATION, 1))
     bounds = np.where(replay.periodic[:, None], [-np.inf, np.inf], [0.0, 1 - 1e-6])
     strategy = cmaes.CMA(
-        best[active], _SPREAD, bounds=bounds, population_size=_POPULATION, seed=len(batches)
+        best[active], _SPREAD, bounds=bounds, population_size=_POPULATION, seed=seed
     )
-    for _ in range(_GENERATIONS):
+    while True:
         candidates = np.stack([strategy.ask() for _ in range(_POPULATION)])
         u[:, active] = np.where(replay.periodic, candidates % 1, candidates)
         costs = least_squares.cost(values.derivatives(u)[0])
         strategy.tell(list(zip(candidates, costs, strict=True)))
         if costs.min() < least:
             best, least = u[costs.argmin()].copy(), costs.min()
-    u = np.tile(best, (least_squares.STARTS, 1))  # as many as `minima` compiles for
-    r, j = replay.derivatives(u)
-    return u[:1], r[:1], j[:1]
+        yield best
 
 
 def method_rows(results: xr.Dataset, study: Methods) -> Rows:

@@ -21,7 +21,7 @@ from rps_jax.runs.question import SimulationQuestion
 from rps_jax.tuning import gradients
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
-from sweeps.gradients.race import COUNTS, check_counts, interval
+from sweeps.gradients.race import COUNTS, Lockstep, PacedGrad, check_counts, interval
 from sweeps.study_base import Parts, Study, Table
 
 
@@ -60,8 +60,15 @@ class Direction(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         options: Any = COUNTS[count]
         slopes = partial(TuneES, estimator="antithetic", **options)
         truth, error, _ = self._gradient(slopes(worlds=self.truth, setting=self._with_seed(0)))
+        pool = Lockstep(1)  # with the programs of all seeds
+
+        def derivatives(setting: Setting) -> TuneGrad:
+            question = PacedGrad(checks=0, setting=setting, **options)
+            object.__setattr__(question, "pool", pool)
+            return question
+
         estimates = {
-            "derivatives": partial(TuneGrad, checks=0, **options),
+            "derivatives": derivatives,
             "slopes": partial(slopes, worlds=128),
         }
         cosines, times = [], []

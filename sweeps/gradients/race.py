@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import itertools
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -25,7 +25,6 @@ import scipy
 import xarray as xr
 
 from rps_jax import RPSParams, Rules, Setting, errors, evaluate
-from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.control import registry
 from rps_jax.laws import resolve_law
@@ -38,13 +37,15 @@ from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.run import Tuning
 from sweeps.study_base import Parts, Study, Table, part_name
 
-TABLES = "sweeps/gradients/tables.py"  # from the root of the repository
-# Options of tunings by the number of tuned parameters: those of RPS, or the entries of tables.
+FOLDER, DRUMS = "sweeps/gradients", ("random_cylinder",)  # from the root of the repository
+# Options of tunings by the number of tuned parameters: those of RPS or RPS+, or entries of tables.
 COUNTS: dict[int, dict[str, Any]] = {
     6: {"tuned": ("K_h", "K_v", "L", "beta", "l_cr", "d_th")},
     13: {"tuned": ("full",)},
-    **{n: {"law": f"{TABLES}:Table{n}", "objects": ("random_cylinder",)} for n in (64, 512, 2048)},
+    18: {"law": "rps_plus", "domain": ("hostile",), "robot": "kairos", "objects": ("random_box",)},
+    **{n: {"law": f"{FOLDER}/tables.py:Table{n}", "objects": DRUMS} for n in (64, 512, 2048)},
 }
+SCORES = "success", "score"  # of a trial in a test world
 FIRST = "derivatives"  # method with which the others are compared
 _LARGE = 500  # parameters from which evolution has a diagonal covariance
 _QUICK = {"worlds": 4, "validation": 4, "objects": ("random_cylinder",)}
@@ -113,7 +114,9 @@ class _Paced(Tuning):
         return xr.Dataset()
 
 
-class _Grad(_Paced, TuneGrad):
+class PacedGrad(_Paced, TuneGrad):
+    """`rps tune grad` that shares its programs with others."""
+
     @functools.cached_property
     def _programs(self) -> dict[Callable[..., Any], Any]:
         return self.pool.programs
@@ -127,8 +130,24 @@ class _ES(_Paced, TuneES):
     pass
 
 
+def timed(limit: float) -> type[Run]:
+    """Return runs that begin no generation after some wall clock [s]."""
+
+    class Timed(Run):
+        """Run with a limit."""
+
+        def steps(self, compute: Any, proceed: Any, **options: Any) -> Iterator[xr.Dataset]:
+            spent = 0.0
+            steps = super().steps(compute, lambda i: proceed(i) and spent < limit, **options)
+            for results in steps:
+                spent += float(results.run)
+                yield results
+
+    return Timed
+
+
 METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
-    "derivatives": (_Grad, {"steps": 16}),
+    "derivatives": (PacedGrad, {"steps": 16}),
     "slopes": (_ES, {"estimator": "antithetic", "worlds": 128, "generations": 10}),
     "evolution": (_ES, {"worlds": 32, "population": 16, "generations": 1000}),
 }
@@ -138,9 +157,9 @@ METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
 class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     """Race derivatives, slopes and evolution: equal simulated time and equal wall time.
 
-    The answer has the `success` (count, seed, method, budget, world) of the tuned laws in test
-    worlds, and that of the law at the start, `start_success` (count, world). Budgets are `wall` or
-    `simulated` with an amount [s].
+    The answer has `success` and `score` (count, seed, method, budget, world) of the tuned laws in
+    test worlds, and those of the law at the start, `start_success` and `start_score` (count,
+    world). Budgets are `wall` or `simulated` with an amount [s].
     """
 
     TITLE: ClassVar[str] = "Derivatives against evolution"
@@ -158,16 +177,17 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     DIMENSION: ClassVar[str] = "count"
     REPORTS_TIMES: ClassVar[bool] = True
 
-    methods: tuple[str, ...] = tuple(METHODS)
-    """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials) or evolution."""
-    counts: tuple[int, ...] = tuple(COUNTS)
-    """Numbers of tuned parameters: 6 and 13 of RPS, or the 64, 512 and 2,048 entries of tables."""
+    methods: tuple[str, ...] = (FIRST, "slopes", "evolution")
+    """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials), or evolution."""
+    counts: tuple[int, ...] = (6, 13, 64, 512, 2048)
+    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, or 64, 512 and
+    2048 entries of tables."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
     simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
     """Budgets of simulated time [s]; a differentiated second counts as four. After the largest no
-    generation starts."""
-    wall: tuple[float, ...] = option((10.0, 30.0), above=0, unit="s")
+    generation starts; without any, those of wall time limit the tunings."""
+    wall: tuple[float, ...] = option((), above=0, unit="s")
     """Budgets of wall time without compilation [s]."""
     worlds: int = option(400, 1, 1_000_000)
     """Number of test worlds of `wide`."""
@@ -180,6 +200,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     def check(self) -> None:
         super().check()
         check_counts(self.counts)
+        if not (self.simulated or self.wall):
+            raise errors.InputError("simulated and wall are empty: give a budget of one of them.")
 
     def parts(self, run: Run) -> Parts:
         """Return the function that runs and tests the tunings of each count."""
@@ -190,29 +212,29 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     def tuning(self, seed: int, count: int, method: str) -> Tuning:
         """Return a tuning of the race."""
         kind, options = METHODS[method]
+        setting, budget = replace(self.setting, seed=seed), max(self.simulated, default=0.0)
         diagonal = {"estimator": "sep_cma"} if method == "evolution" and count >= _LARGE else {}
         sizes = _QUICK if self.quick else {}
-        limits = {"validation": 64, "budget": max(self.simulated)}
-        setting = replace(self.setting, seed=seed)
+        limits = {"validation": 64, "budget": budget}
         return kind(**{**COUNTS[count], **limits, **options, **diagonal, **sizes}, setting=setting)
 
     def _compete(self, folder: Path, count: int) -> xr.Dataset:
         """Run the tunings of a count, and test their best laws within each budget."""
         labels = list(itertools.product(self.seeds, (count,), self.methods))
         folders = [folder / part_name(*label) for label in labels]
+        questions = [self.tuning(*label) for label in labels]
         pool = Lockstep(len(labels))
+        limited = timed(np.inf if self.simulated else max(self.wall))
 
         def run(question: Tuning, at: Path) -> pd.DataFrame:
+            at.mkdir(exist_ok=True)
             try:
-                question.answer(Run(at, no_progress))
+                object.__setattr__(question, "pool", pool)
+                question.answer(limited(at, no_progress))
                 return pd.read_csv(at / "curve.csv")
             finally:
                 pool.leave()
 
-        questions = [self.tuning(*label) for label in labels]
-        for question, at in zip(questions, folders, strict=True):
-            object.__setattr__(question, "pool", pool)
-            at.mkdir(exist_ok=True)
         with ThreadPoolExecutor(len(labels)) as threads:
             curves = list(threads.map(run, questions, folders))
         budgets = [(name, amount) for name in BUDGETS for amount in getattr(self, name)]
@@ -223,8 +245,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         _, firsts, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
         chosen = [law_of(best[at], start) for at in firsts]
         options = {"split": "test", "setting": self.setting, "progress": False}
-        scores = evaluate([start, *chosen], domain, self.worlds, **options)
-        start_success, *tuned = scores.success.values.astype(np.int8)
+        robot = COUNTS[count].get("robot")
+        scores = evaluate([start, *chosen], domain, self.worlds, robot=robot, **options)
         dims, shape = ("seed", "method"), (len(self.seeds), len(self.methods))
         by_tuning = {
             "generations": [len(curve) for curve in curves],
@@ -234,17 +256,17 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             ],
             **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
         }
-        variables = {name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()}
-        success = np.array(tuned)[inverse.ravel()].reshape(*shape, len(budgets), -1)
+        variables: dict[str, Any] = {
+            name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()
+        }
+        for name in SCORES:
+            first, *tuned = scores[name].values.astype(np.float32)
+            by_budget = np.array(tuned)[inverse.ravel()].reshape(*shape, len(budgets), -1)
+            variables[f"start_{name}"] = ("world", first)
+            variables[name] = ((*dims, "budget", "world"), by_budget)
         names = [f"{name} {amount:g} s" for name, amount in budgets]
-        return xr.Dataset(
-            variables
-            | {
-                "start_success": ("world", start_success),
-                "success": ((*dims, "budget", "world"), success),
-            },
-            {"seed": list(self.seeds), "method": list(self.methods), "budget": names},
-        )
+        coords = {"seed": list(self.seeds), "method": list(self.methods), "budget": names}
+        return xr.Dataset(variables, coords)
 
     def intro(self, results: xr.Dataset) -> str:
         """Return the budgets."""
@@ -267,8 +289,13 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
                 "format": "{:+.1f} points",
                 "rest": " [{:+.1f}, {:+.1f}]",
             },
+            {"name": "objective", "format": "{:.3f}"},
+            {
+                "name": "derivatives lower by",
+                "format": "{:+.3f}",
+                "rest": " [{:+.3f}, {:+.3f}]",
+            },
             {"name": "by seed"},
-            {"name": "gained, lost"},
             {"name": "generations"},
         ]
         text = "Square brackets: 95 % intervals over the seeds, by Student's t."
@@ -303,8 +330,8 @@ def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
 def problem(count: int) -> tuple[Any, str]:
     """Return the law at the start and the domain of the test worlds of a problem."""
     _, start = resolve_law(COUNTS[count].get("law", "rps"))
-    objects = COUNTS[count].get("objects", ())
-    return start, ",".join(["wide", *(f"objects={name}" for name in objects)])
+    (domain,), objects = COUNTS[count].get("domain", ("wide",)), COUNTS[count].get("objects", ())
+    return start, ",".join([domain, *(f"objects={name}" for name in objects)])
 
 
 def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:
@@ -335,22 +362,29 @@ def table(results: xr.Dataset) -> list[list[Any]]:
     rows: list[list[Any]] = []
     for count, budget in itertools.product(results["count"].values, results.budget.values):
         of_count = results.sel(count=count)
-        start = of_count.start_success
         if budget == results.budget.values[0]:
-            rows.append([str(count), "", "start", 100 * float(start.mean()), None, "", "", ""])
-        means = 100 * of_count.success.sel(budget=budget).mean("world")
-        for method in map(str, results.method.values):
-            chosen = of_count.sel({"method": method})  # `method` is an argument of `sel`
-            values, ahead = means.sel({"method": method}).values, None
-            if method != FIRST and FIRST in means.method:
-                ahead = interval(means.sel({"method": FIRST}).values - values)
-            compared = [statistics.compare(start, x) for x in chosen.success.sel(budget=budget)]
-            gained, lost = (sum(getattr(c, x) for c in compared) for x in ("gained", "lost"))
-            seeds = ", ".join(f"{x:.1f}" for x in values)
-            counts = f"+{gained} -{lost}", f"{float(chosen.generations.mean()):.0f}"
-            name, amount, unit = str(budget).split()
+            success, score = (float(of_count[f"start_{x}"].mean()) for x in SCORES)
+            rows.append([str(count), "", "start", 100 * success, None, score, None, "", ""])
+        means = of_count[[*SCORES]].sel(budget=budget).mean("world").transpose("method", "seed")
+        by_method = dict(
+            zip(map(str, means.method.values), 100 * means.success.values, strict=True)
+        )
+        scores = dict(zip(by_method, means.score.values, strict=True))
+        name, amount, unit = str(budget).split()
+        for method, success in by_method.items():
+            ahead = lower = None
+            if method != FIRST and FIRST in by_method:
+                ahead, lower = (
+                    interval(by_method[FIRST] - success),
+                    interval(scores[method] - scores[FIRST]),
+                )
+            seeds = ", ".join(f"{x:.1f}" for x in success)
+            generations = of_count.generations.sel(
+                {"method": method}
+            ).mean()  # an argument of `sel`
             label = f"{name} time, {float(amount):,g} {unit}"
-            rows.append([str(count), label, method, interval(values), ahead, seeds, *counts])
+            cells = [interval(success), ahead, float(scores[method].mean()), lower, seeds]
+            rows.append([str(count), label, method, *cells, f"{float(generations):.0f}"])
     return rows
 
 

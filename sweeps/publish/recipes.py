@@ -348,11 +348,15 @@ RECIPES: dict[str, Recipe] = {
     "plans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "gradients_mjx": recipe(f"rps sweeps/gradients/mjx.py {_MACHINE}", cores=6),
-    "gradients_race": recipe(f"rps sweeps/gradients/race.py --counts 64 2048 {_MACHINE}", cores=80),
-    "gradients_race_13": recipe(
-        "rps sweeps/gradients/race.py --counts 13 --simulated 1e5 --wall 10 "
-        f"--file gradients_race_13 {_MACHINE}",
-        cores=20,
+    "gradients_stiff": recipe(f"rps sweeps/gradients/stiff.py {_MACHINE}", cores=3),
+    "gradients_direction": recipe(
+        f"rps sweeps/gradients/direction.py --counts 6 64 2048 --truth 4096 {_MACHINE}", cores=15
+    ),
+    "gradients_race": recipe(f"rps sweeps/gradients/race.py --wall 10 30 {_MACHINE}", cores=200),
+    "gradients_race_18": recipe(
+        "rps sweeps/gradients/race.py --counts 18 --methods derivatives evolution --simulated "
+        f"--wall 30 60 120 --file gradients_race_18 {_MACHINE}",
+        cores=40,
     ),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     **dict.fromkeys(
@@ -360,6 +364,7 @@ RECIPES: dict[str, Recipe] = {
         recipe(f"rps sweeps/fit {_MACHINE}", cores=15),
     ),
     "fit_bags": recipe(f"rps sweeps/fit/bags.py {_MACHINE}", cores=5),
+    "fit_one_push": recipe(f"rps sweeps/fit/one_push.py {_MACHINE}", cores=20),
     "fit_methods*": recipe(f"rps sweeps/fit/methods.py {_MACHINE}", cores=25),
     "mit*": recipe(f"rps sweeps/real_pushes/mit --data FOLDER {_MACHINE}", cores=30),
     "fit_real*": recipe(f"rps sweeps/real_pushes/fit.py {_MACHINE}", cores=12),
