@@ -24,6 +24,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import numpy as np
+import scipy.special
 import xarray as xr
 
 from rps_jax import InputError, Setting, errors
@@ -367,3 +368,12 @@ def _without_unread_folder(command: Sequence[str], commands: Sequence[Sequence[s
     words, folder = split_folder(command)
     is_read = folder and any(_reads_folder(split_folder(c)[0], folder) for c in commands)
     return list(command) if is_read else words
+
+
+def interval(values: np.ndarray) -> list[float]:
+    """Return the mean of independent values (n,) and the limits of its 95 % interval."""
+    mean, count = float(values.mean()), values.size
+    if count < 2:
+        return [mean]
+    half = values.std(ddof=1) / np.sqrt(count) * float(scipy.special.stdtrit(count - 1, 0.975))
+    return [mean, mean - half, mean + half]

@@ -29,8 +29,7 @@ from rps_jax.world.points import Points
 from rps_jax.worlds import parse_domain
 from sweeps.fit import least_squares, methods
 from sweeps.fit.least_squares import STARTS, Replay, Track
-from sweeps.gradients.race import interval
-from sweeps.study_base import Parts, Study, Table
+from sweeps.study_base import Parts, Study, Table, interval
 
 FITTED = ("friction_robot", "friction_ground", "mass", "com_offset", "com_bearing")
 _METHODS = ("derivatives", "evolution")

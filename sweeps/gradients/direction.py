@@ -21,8 +21,8 @@ from rps_jax.runs.question import SimulationQuestion
 from rps_jax.tuning import gradients
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
-from sweeps.gradients.race import COUNTS, Lockstep, PacedGrad, check_counts, interval
-from sweeps.study_base import Parts, Study, Table
+from sweeps.gradients.race import COUNTS, Lockstep, PacedGrad, check_counts
+from sweeps.study_base import Parts, Study, Table, interval
 
 
 @dataclass(frozen=True)

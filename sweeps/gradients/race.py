@@ -21,7 +21,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
-import scipy
 import xarray as xr
 
 from rps_jax import RPSParams, Rules, Setting, errors, evaluate
@@ -35,7 +34,7 @@ from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.run import Tuning
-from sweeps.study_base import Parts, Study, Table, part_name
+from sweeps.study_base import Parts, Study, Table, interval, part_name
 
 FOLDER, DRUMS = "sweeps/gradients", ("random_cylinder",)  # from the root of the repository
 # Options of tunings by the number of tuned parameters: those of RPS or RPS+, or entries of tables.
@@ -346,15 +345,6 @@ def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:
         leaves["l_mr"] = np.minimum(leaves["l_mr"], leaves["l_cr"])  # as in the tuning: see `Space`
     single = {k: x if x.ndim else float(x) for k, x in leaves.items()}
     return registry.replace_leaves(start, single)
-
-
-def interval(values: np.ndarray) -> list[float]:
-    """Return the mean of independent values (n,) and the limits of its 95 % interval."""
-    mean, count = float(values.mean()), values.size
-    if count < 2:
-        return [mean]
-    half = values.std(ddof=1) / np.sqrt(count) * float(scipy.special.stdtrit(count - 1, 0.975))
-    return [mean, mean - half, mean + half]
 
 
 def table(results: xr.Dataset) -> list[list[Any]]:
