@@ -403,8 +403,12 @@ def test_a_custom_law_is_compared_with_xla_before_a_run_once(mine, cache, monkey
         with pytest.warns(UserWarning, match="law of MineParams gives other results as compiled"):
             law_check.warn_of_difference(part.with_params(mine), setting)
         monkeypatch.setattr(native, "batched", None)  # the result is cached
-    monkeypatch.setattr(native, "compared", None)
-    law_check.warn_of_difference(part.with_params(registry.resolve_law("rps")[1]), setting)
+
+
+def test_a_law_of_the_package_is_not_compared(monkeypatch):
+    monkeypatch.setattr(law_check, "warn_of_difference", None)
+    setting = setting_of(0.2, "fused")
+    assert sweep("rps", "wide,objects=box,gap=0.01", worlds=2, setting=setting).sizes["world"] == 2
 
 
 @pytest.mark.parity

@@ -98,7 +98,7 @@ class Shadow(BagQuestion[xr.Dataset]):
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Return the differences between the twists of the law and the recorded ones."""
         rows = [["", "root mean square", "greatest", "at time [s]"]]
-        is_nan = ~np.isfinite(results.to_array().sel(source="law")).all("variable").values
+        is_nan = ~np.isfinite(results.to_array().sel(source="law").values).all(axis=0)
         finite = results.isel(time=~is_nan)
         for name, unit in ((name, COLUMNS["twist"][name]) for name in map(str, results)):
             error = np.abs(finite[name].sel(source="law") - finite[name].sel(source="commanded"))

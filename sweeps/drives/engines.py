@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import xarray as xr
@@ -37,7 +38,7 @@ class DriveEngines(Drives):
     domains: Sequence[str] = ("wide",)
     """Names of domains."""
 
-    @property
+    @cached_property
     def plans(self) -> dict[str, Plan]:
         """The sweep of each row, in both engines."""
         plans = {}
