@@ -57,7 +57,7 @@ def never_stepping() -> contextlib.ExitStack:
     from rps_jax.tuning.learn import Learn
 
     stack = contextlib.ExitStack()
-    for owner, name in ((trial, "start_all"), (Learn, "start"), (film, "_shots")):
+    for owner, name in ((trial, "start_all"), (Learn, "answer"), (film, "_shots")):
         stack.enter_context(mock.patch.object(owner, name, side_effect=Accepted))
     return stack
 

@@ -25,14 +25,16 @@ def test_the_table_has_intervals_over_the_seeds():
     dims, methods = ("count", "seed", "method"), ["derivatives", "slopes"]
     variables = {
         "success": ((*dims, "budget", "world"), success[None, :, :, None]),
+        "score": ((*dims, "budget", "world"), 1.0 - success[None, :, :, None]),
         "start_success": (("count", "world"), [[1, 1, 0, 0]]),
+        "start_score": (("count", "world"), [[0.0, 0.0, 1.0, 1.0]]),
         "generations": (dims, [[[5, 8], [7, 8]]]),
     }
     coords = {"count": [64], "seed": [1, 2], "method": methods, "budget": ["wall 10 s"]}
     start, first, second = race.table(xr.Dataset(variables, coords))
-    assert start[:4] == ["64", "", "start", 50.0]
+    assert start[:6] == ["64", "", "start", 50.0, None, 0.5]
     assert first[1:3] == ["wall time, 10 s", "derivatives"]
     half = 12.7062 * 12.5  # of Student's t with 1 degree of freedom
     assert_allclose(first[3], [87.5, 87.5 - half, 87.5 + half], rtol=1e-4)
-    assert first[5:] == ["75.0, 100.0", "+3 -0", "6"]
-    assert_allclose(second[4], [25.0, 25.0, 25.0])
+    assert first[5:] == [0.125, None, "75.0, 100.0", "6"]
+    assert_allclose(second[4:7:2], [[25.0] * 3, [0.25] * 3])
