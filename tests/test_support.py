@@ -154,7 +154,7 @@ def integrals():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(quasistatic, "_LEAST_RADIUS", 1e-3)
         for kind in KINDS:
-            at, share = distribution("box", kind, 60)
+            at, share = distribution("box", kind, 30)
             inputs, qpos = inputs_of("box", "corners")
             box = inputs.solids
             feet = np.column_stack([at, share])[None]
