@@ -33,7 +33,8 @@ FILE = Path(__file__).with_name("publish") / "probes.json"
 TOLERANCE = 0.05  # of the root mean square of a variable, on another processor
 _SWEEPS = Path(__file__).parent
 _PACKAGES = ("jax", "mujoco", "numpy")
-_WALL_TIMES = ("compile", "run", "differentiate")  # variables of results
+# Variables of results, after the probe in which they are.
+_WALL_TIMES = ("compile", "run", "differentiate", "learn/time")
 _FLOAT = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _BOX = "wide,objects=random_box"
 _SHORT = "--horizon 20"
@@ -76,7 +77,6 @@ PROBES = {
     "export_c": "export c --law rps_plus",
     "export_js": "export js --law rps",
     "real_pushes": f"{_SWEEPS / 'real_pushes'} --quick --mujoco 0",
-    "planning": f"{_SWEEPS / 'planning'} --quick",
 }
 _TRIALS = ("wide", "hostile", "real")
 # Probes of each data file, by the first pattern that its name has. A measured time has none.
@@ -104,7 +104,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "fit_real*": ("real_pushes", "tune_es"),
     "fit_*": ("push_fused", "wide", "tune_es"),
     "real_pushes_*": ("real_pushes",),
-    "gradients_*": ("planning", "tune_grad", "learn"),
+    "gradients_*": ("tune_grad", "learn"),
     **dict.fromkeys(("ground", "straight"), ("push_mujoco", "push_fused")),
     "support*": ("wide", "hardware"),
     "mit*": ("real_pushes",),
@@ -116,7 +116,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("learned_variants", "learned_continued"), ("hostile", "learn")),
     "mends": ("wide", "hostile", "tune_es"),
     **dict.fromkeys(("limits", "sizes"), ("wide", "hostile")),
-    **dict.fromkeys(("plans", "replans"), ("planning",)),
+    **dict.fromkeys(("plans", "replans"), ("quasistatic",)),
     "feet": ("wide", "feet"),
     **dict.fromkeys(("headline", "models"), (*_TRIALS, "path", "corridor", "mujoco")),
     **dict.fromkeys(("million", "random_worlds", "robots"), ("wide", "real")),
@@ -245,7 +245,8 @@ def _variables(out: Path) -> Iterable[tuple[str, list[Any]]]:
                 for group in tree.subtree:
                     for name, values in group.variables.items():
                         array = np.ascontiguousarray(values)
-                        if array.dtype.kind in "biuf" and name not in _WALL_TIMES:
+                        is_measured = {name, f"{out.name}/{name}"} & {*_WALL_TIMES}
+                        if array.dtype.kind in "biuf" and not is_measured:
                             key = f"{path.stem}{group.path.rstrip('/')}/{name}"
                             yield key, _row(array)
         elif path.suffix in (".h", ".mjs"):  # the numbers, without comments
