@@ -69,6 +69,22 @@ STALE: dict[str, str] = {
     **dict.fromkeys(
         ("ground", "straight"), "a push ran in the program of a sweep, with other last bits"
     ),
+    **dict.fromkeys(
+        (
+            "fit_one_push",
+            "gradients_direction",
+            "gradients_race",
+            "gradients_race_18",
+            "gradients_stiff",
+            "pose",
+            "pose_failures",
+            "pose_parity",
+            "support",
+            "support_hardware",
+        ),
+        "a sum in the solver got its former order back, with other last bits",
+    ),
+    "drives_engines": "`unicycle` turned during its retreats",
 }
 NUMBERS = SWEEPS / "publish" / "numbers.json"
 _NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"

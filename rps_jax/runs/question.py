@@ -217,7 +217,11 @@ class Command(Generic[T]):
         """Return whether processors finish sooner than a GPU, by engine and number of trials."""
         if self._setting is None or jax.config.jax_platforms:
             return False
-        return self._setting.simulator.suits_processors(self.num_trials())
+        try:
+            count = self.num_trials()
+        except (errors.InputError, LookupError):  # of options that `validate` refuses
+            return False
+        return self._setting.simulator.suits_processors(count)
 
     @property
     def _setting(self) -> Setting | None:

@@ -317,11 +317,11 @@ RECIPES: dict[str, Recipe] = {
     **dict.fromkeys(
         ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 800 {_MACHINE}", cores=20)
     ),
-    "drives": recipe(f"rps sweeps/drives --worlds 5000 {_MACHINE}", cores=300, gpu=6),
+    "drives": recipe(f"rps sweeps/drives --worlds 4000 {_MACHINE}", cores=14, gpu=6),
     "drives_omni": recipe(
-        "rps sweeps/drives --seed 7017 --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "
+        "rps sweeps/drives --worlds 4000 --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "
         f"'round, holonomic, rps_plus' 'round, holonomic, rps_reposition' {_MACHINE}",
-        cores=200,
+        cores=6,
         gpu=5,
         section="Drives",
     ),
