@@ -99,6 +99,15 @@ def text_table(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) ->
     return [list(columns), *(["" if re.search(r"\bnan\b", x) else x for x in row] for row in texts)]
 
 
+def mean_interval(values: np.ndarray) -> list[float]:
+    """Return the mean of independent values (n,) and the limits of its 95 % interval."""
+    mean, count = float(values.mean()), values.size
+    if count < 2:
+        return [mean]
+    half = values.std(ddof=1) / np.sqrt(count) * float(scipy.special.stdtrit(count - 1, 0.975))
+    return [mean, mean - half, mean + half]
+
+
 def median_interval(values: np.ndarray, resamples: int = 2000) -> tuple[float, float, float]:
     """Return the median of values (n,) and its 95 % interval by a bootstrap."""
     drawn = np.random.default_rng(0).choice(values, (resamples, values.size))
@@ -368,12 +377,3 @@ def _without_unread_folder(command: Sequence[str], commands: Sequence[Sequence[s
     words, folder = split_folder(command)
     is_read = folder and any(_reads_folder(split_folder(c)[0], folder) for c in commands)
     return list(command) if is_read else words
-
-
-def interval(values: np.ndarray) -> list[float]:
-    """Return the mean of independent values (n,) and the limits of its 95 % interval."""
-    mean, count = float(values.mean()), values.size
-    if count < 2:
-        return [mean]
-    half = values.std(ddof=1) / np.sqrt(count) * float(scipy.special.stdtrit(count - 1, 0.975))
-    return [mean, mean - half, mean + half]

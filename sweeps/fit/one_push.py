@@ -29,10 +29,9 @@ from rps_jax.world.points import Points
 from rps_jax.worlds import parse_domain
 from sweeps.fit import least_squares, methods
 from sweeps.fit.least_squares import STARTS, Replay, Track
-from sweeps.study_base import Parts, Study, Table, interval
+from sweeps.study_base import Parts, Study, Table, mean_interval
 
 FITTED = ("friction_robot", "friction_ground", "mass", "com_offset", "com_bearing")
-_METHODS = ("derivatives", "evolution")
 _WINDOWS = 8  # of each log; a log with fewer is skipped
 _KEYS = "key_0", "key_1"
 
@@ -110,8 +109,12 @@ class OnePush(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         starts[:, replay.active] = random.random((STARTS, len(replay.active)))
         costs = least_squares.cost(replay.derivatives(starts)[0])
         best, least = starts[np.argmin(costs)], float(np.min(costs))
-        for function in (self._descend, methods.evolve):
-            next(function(replay, best if function is methods.evolve else starts, least, index))
+        fits = {
+            "derivatives": partial(_descend, replay, starts),
+            "evolution": partial(methods.evolve, replay, best, least, index),
+        }
+        for begin in fits.values():
+            next(begin())  # compiles
         column = points.names(replay.domain).index("friction_robot")
 
         def measure(u: np.ndarray) -> list[float]:
@@ -121,13 +124,8 @@ class OnePush(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             return [float(moved), float(abs(u - truth)[column])]
 
         results, counts = [], []
-        for name in _METHODS:
-            steps = (
-                self._descend(replay, starts, least, index)
-                if name == "derivatives"
-                else methods.evolve(replay, best, least, index)
-            )
-            history, start = [(0.0, best)], time.perf_counter()
+        for begin in fits.values():
+            steps, history, start = begin(), [(0.0, best)], time.perf_counter()
             while history[-1][0] < max(self.wall):
                 u = next(steps)
                 history.append((time.perf_counter() - start, u))
@@ -144,14 +142,8 @@ class OnePush(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
                 "start_friction": friction,
                 "iterations": ("method", counts),
             },
-            {"method": list(_METHODS), "budget": list(self.wall)},
+            {"method": list(fits), "budget": list(self.wall)},
         )
-
-    @staticmethod
-    def _descend(replay: Replay, u: np.ndarray, least: float, seed: int) -> Iterator[np.ndarray]:
-        """Yield the best point (q,) after each iteration with derivatives."""
-        for points_, r, _ in replay.descend(u):
-            yield points_[np.argmin(least_squares.cost(r))].copy()
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the errors by budget and method."""
@@ -168,21 +160,28 @@ class OnePush(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             {"name": "error of the friction with the robot", "format": "{:.1f} %", **rest},
             {"name": "iterations a second", "format": "{:.1f}"},
         ]
-        start = [interval(k * results[f"start_{x}"].values) for k, x in _SHOWN]
+        start = [mean_interval(k * results[f"start_{x}"].values) for k, x in _SHOWN]
         rows: list[list[Any]] = [["", "best start", start[0], None, start[1], None]]
-        for budget, method in np.ndindex(results.sizes["budget"], len(_METHODS)):
+        for budget, method in np.ndindex(results.sizes["budget"], results.sizes["method"]):
             both = results.isel(budget=budget)
             chosen = both.isel({"method": method})
             error, friction = (k * chosen[x].values for k, x in _SHOWN)
-            ahead = None if not method else interval(error - 1e3 * both.prediction.values[:, 0])
+            more = error - 1e3 * both.prediction.values[:, 0]
+            cells = mean_interval(error), mean_interval(more) if method else None
             rate = float(chosen.iterations.mean()) / max(self.wall)
-            wall = f"{float(both.budget):g} s"
-            rows.append([wall, _METHODS[method], interval(error), ahead, interval(friction), rate])
+            label = f"{float(both.budget):g} s", str(chosen.method.values)
+            rows.append([*label, *cells, mean_interval(friction), rate])
         text = (
             f"{results.sizes['object']} boxes. Errors of the predicted motion in 2 s, and of the "
             "friction as a share of its range. Square brackets: 95 % intervals by Student's t."
         )
         return [Table(rows, text, columns, name="fit_one_push", title="Errors")]
+
+
+def _descend(replay: Replay, starts: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the best point (q,) after each iteration with derivatives."""
+    for points_, r, _ in replay.descend(starts):
+        yield points_[np.argmin(least_squares.cost(r))].copy()
 
 
 _SHOWN = ((1e3, "prediction"), (100.0, "friction"))

@@ -22,7 +22,7 @@ from rps_jax.tuning import gradients
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
 from sweeps.gradients.race import COUNTS, Lockstep, PacedGrad, check_counts
-from sweeps.study_base import Parts, Study, Table, interval
+from sweeps.study_base import Parts, Study, Table, mean_interval
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class Direction(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             [
                 str(count),
                 estimate,
-                interval(at.cosine.values),
+                mean_interval(at.cosine.values),
                 float(at.reliability),
                 float(at.simulated),
             ]

@@ -34,7 +34,7 @@ from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.run import Tuning
-from sweeps.study_base import Parts, Study, Table, interval, part_name
+from sweeps.study_base import Parts, Study, Table, mean_interval, part_name
 
 FOLDER, DRUMS = "sweeps/gradients", ("random_cylinder",)  # from the root of the repository
 # Options of tunings by the number of tuned parameters: those of RPS or RPS+, or entries of tables.
@@ -365,16 +365,15 @@ def table(results: xr.Dataset) -> list[list[Any]]:
             ahead = lower = None
             if method != FIRST and FIRST in by_method:
                 ahead, lower = (
-                    interval(by_method[FIRST] - success),
-                    interval(scores[method] - scores[FIRST]),
+                    mean_interval(by_method[FIRST] - success),
+                    mean_interval(scores[method] - scores[FIRST]),
                 )
             seeds = ", ".join(f"{x:.1f}" for x in success)
-            generations = of_count.generations.sel(
-                {"method": method}
-            ).mean()  # an argument of `sel`
+            chosen = of_count.sel({"method": method})  # `method` is an argument of `sel`
             label = f"{name} time, {float(amount):,g} {unit}"
-            cells = [interval(success), ahead, float(scores[method].mean()), lower, seeds]
-            rows.append([str(count), label, method, *cells, f"{float(generations):.0f}"])
+            cells = [mean_interval(success), ahead, float(scores[method].mean()), lower, seeds]
+            generations = f"{float(chosen.generations.mean()):.0f}"
+            rows.append([str(count), label, method, *cells, generations])
     return rows
 
 
@@ -388,7 +387,7 @@ def draw(results: xr.Dataset) -> Figure:
         ax.plot(counts, 100 * results.start_success.mean("world"), "k:", label="start")
         for at, method in enumerate(results.method.values):
             values = means.sel({"budget": budget, "method": method})
-            mean, *limits = np.transpose([interval(x) for x in values.values])
+            mean, *limits = np.transpose([mean_interval(x) for x in values.values])
             error = np.abs(np.array(limits) - mean) if limits else None
             marks = {"marker": "o", "markersize": 3, "capsize": 2}
             ax.errorbar(counts * 1.08**at, mean, error, label=method, **marks)
