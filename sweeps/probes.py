@@ -33,7 +33,7 @@ FILE = Path(__file__).with_name("publish") / "probes.json"
 TOLERANCE = 0.05  # of the root mean square of a variable, on another processor
 _SWEEPS = Path(__file__).parent
 _PACKAGES = ("jax", "mujoco", "numpy")
-# Variables of results, after the probe in which they are.
+# Measured variables of results; with a slash, those of one probe.
 _WALL_TIMES = ("compile", "run", "differentiate", "learn/time")
 _FLOAT = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _BOX = "wide,objects=random_box"
@@ -126,7 +126,6 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
         ("arena", "commands*", "compilers*", "costs", "derivatives*", "environments*", "gpus"), ()
     ),
     **dict.fromkeys(("kernel", "levers", "robot", "speed*", "tasks_cost_*"), ()),
-    "environments*": (),
 }
 
 
@@ -245,7 +244,7 @@ def _variables(out: Path) -> Iterable[tuple[str, list[Any]]]:
                 for group in tree.subtree:
                     for name, values in group.variables.items():
                         array = np.ascontiguousarray(values)
-                        is_measured = {name, f"{out.name}/{name}"} & {*_WALL_TIMES}
+                        is_measured = name in _WALL_TIMES or f"{out.name}/{name}" in _WALL_TIMES
                         if array.dtype.kind in "biuf" and not is_measured:
                             key = f"{path.stem}{group.path.rstrip('/')}/{name}"
                             yield key, _row(array)
