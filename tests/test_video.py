@@ -212,6 +212,16 @@ def test_without_rendering_the_check_names_the_fix(monkeypatch):
     assert done.stderr == ""
 
 
+def test_no_renderer_is_made_without_a_context(monkeypatch):
+    """Of GLFW, which then ends the process on some machines."""
+    mujoco = rendering._import_mujoco()
+    context = SimpleNamespace(GLContext=lambda *_: SimpleNamespace(_context=None))
+    monkeypatch.setattr(mujoco.rendering.classic, "gl_context", context)
+    monkeypatch.setattr(mujoco, "Renderer", lambda *_, **__: pytest.fail("a renderer is made"))
+    with fails_in_one_sentence("apt install libegl1"):
+        rendering.check_rendering()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere MuJoCo needs no choice of GL")
 def test_an_egl_that_does_not_work_is_no_fault_of_the_users_variables(monkeypatch):
     for name in ("MUJOCO_GL", "DISPLAY"):
