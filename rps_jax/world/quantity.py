@@ -4,7 +4,7 @@ A quantity is a field of a domain or of a task. Its random numbers are one strea
 addressed by (seed, name, index). The number of a name in world i depends on the seed, the name and
 i alone: a name that is added changes no other number. Bits come from Philox, a counter-based
 generator, keyed by the seed and a hash of the name. Names of version 0.4 and earlier have columns
-of one table instead, which is frozen, so that published worlds stay as they are.
+of one table instead, which is frozen, so that published worlds stay unchanged.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from rps_jax.geometry.arrays import Number, Parameter
 from rps_jax.spec import Bound, Spec, document
 
 _AHEAD = 1.26  # [rad] by which the base aims ahead on the circle
-_ASIDE = 0.5  # [rad] of the next guess of M beside the heading of an approach that missed
+_SEARCH_ANGLE = 0.5  # [rad] of the next guess of M beside the heading of an approach that missed
 _ARRIVED, _CLEAR = 0.1, 0.1  # [m] errors at the staging point, and of the circle
 
 
@@ -116,7 +116,7 @@ def step(
     is_finished = approach & touches
     front = base + half_length * planar.unit(yaw)
     missed = approach & (jnp.sum((front - middle) * planar.unit(yaw)) > params.r)
-    ahead = front + params.r * planar.unit(yaw + _ASIDE * way.side)
+    ahead = front + params.r * planar.unit(yaw + _SEARCH_ANGLE * way.side)
     middle = jnp.where(missed, ahead, middle)
     approach, away = approach & ~is_finished & ~missed, away & ~is_finished
 
