@@ -42,6 +42,15 @@ PRIOR: Mapping[str, tuple[float, float]] = {
     "tilt_y": (0.0, 0.4),
     "saddle": (0.0, 0.4),
     "shear": (0.0, 0.4),
+    "cubic_x": (0.0, 0.3),
+    "cubic_y": (0.0, 0.3),
+    "trefoil_x": (0.0, 0.3),
+    "trefoil_y": (0.0, 0.3),
+    "quartic": (0.0, 0.3),
+    "quartic_saddle": (0.0, 0.2),
+    "quartic_shear": (0.0, 0.2),
+    "quatrefoil_x": (0.0, 0.2),
+    "quatrefoil_y": (0.0, 0.2),
     "camera_x": (0.0, 1e-3),
     "camera_y": (0.0, 1e-3),
     "marker_x": (0.0, 5e-4),
@@ -60,7 +69,7 @@ _INSIDE = 5e-3  # [m] of the finger in the object at the start, at most
 _SCATTER = {"place": (3e-4, 0.045), "turn": (5e-3, 0.075)}
 _QUANTILE, _PSEUDO = {"place": 2.75, "turn": 2.7}, 20
 _FEW, _BATCH = 32, 512  # pushes of a batch
-_PADS = 64
+_PADS, _CORNERS = 64, (8, 128)  # of an object, padded
 _COLUMNS = {"push": "", "time": "s", "x": "m", "y": "m", "yaw": "rad", "tip_x": "m", "tip_y": "m"}
 
 
@@ -115,9 +124,14 @@ def _pressure(theta: Mapping[str, jax.Array], pads: np.ndarray) -> jax.Array:
     at, load = pads[:, :2], pads[:, 2]
     at = at - load @ at
     x, y = (at / jnp.sqrt(load @ jnp.sum(at**2, axis=1))).T
-    functions = {"ring": x * x + y * y - 1, "tilt_x": x, "tilt_y": y}
-    functions |= {"saddle": x * x - y * y, "shear": 2 * x * y}
-    logarithm: Any = sum(theta[name] * value for name, value in functions.items())
+    square, saddle, shear = x * x + y * y, x * x - y * y, 2 * x * y
+    functions = {"ring": square - 1, "tilt_x": x, "tilt_y": y, "saddle": saddle, "shear": shear}
+    functions |= {"cubic_x": x * (square - 2), "cubic_y": y * (square - 2)}
+    functions |= {"trefoil_x": x * saddle - y * shear, "trefoil_y": x * shear + y * saddle}
+    functions |= {"quartic": square * square - 3 * square + 1}
+    functions |= {"quartic_saddle": saddle * (square - 2), "quartic_shear": shear * (square - 2)}
+    functions |= {"quatrefoil_x": saddle**2 - shear**2, "quatrefoil_y": 2 * saddle * shear}
+    logarithm: Any = sum(theta[name] * f for name, f in functions.items() if name in theta)
     share = load * jnp.exp(jnp.clip(logarithm, -8.0, 8.0))
     return share / share.sum()
 
@@ -221,10 +235,12 @@ class ObjectFit:
 
 
 def _fixed(outline: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return outline, pads and radius; unused pads make programs of many outlines one."""
+    """Return outline, pads and radius, repeated so that many objects share a program."""
     pads = finger.uniform_pads(outline)
     unused = np.repeat(pads[-1:] * [1, 1, 0, 1], max(0, _PADS - len(pads)), axis=0)
-    return outline, np.concatenate([pads, unused]), radius
+    corners = next((n for n in _CORNERS if n >= len(outline)), len(outline))
+    again = np.repeat(outline[-1:], corners - len(outline), axis=0)
+    return np.concatenate([outline, again]), np.concatenate([pads, unused]), radius
 
 
 def _padded(pushes: Pushes, first: int) -> tuple[list[jax.Array], int]:
