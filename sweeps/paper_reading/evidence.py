@@ -93,10 +93,11 @@ def summary(results: xr.Dataset) -> str:
     weights = _of_simulations(results, normalised(log_weights(results)))
     cells, several = _cells(results), results.sizes["draw"] // weights.size
     drawn = f"the text and the simulation, each with {several} draws of the hardware"
-    inside = (
-        f"The closest draw has {int(_matches(results, cells)[closest(results)])} of {len(cells)} "
-        "cells of Table II inside the paper's Wilson intervals."
-    )
+    inside = ""
+    if cells:
+        count = int(_matches(results, cells)[closest(results)])
+        inside = f" The closest draw has {count} of {len(cells)} cells of Table II inside the "
+        inside += "paper's Wilson intervals."
     return (
         f"{weights.size:,} draws of {drawn if cells else 'the text and the hardware'}: "
         f"{len(unknowns_of(results))} unknowns against {len(_names(results))} numbers and "
@@ -104,7 +105,7 @@ def summary(results: xr.Dataset) -> str:
         f"{effective(weights):.0f}. A mean has a normal likelihood, with a standard deviation of "
         f"{1000 * printed.D:g} mm for D and {printed.TIME:g} s for times; a count a beta-binomial "
         "one; an observation in the text is wrong with a probability of "
-        f"{100 * printed.WRONG:g} %. {inside if cells else ''}"
+        f"{100 * printed.WRONG:g} %.{inside}"
     )
 
 
