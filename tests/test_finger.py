@@ -109,7 +109,7 @@ def measured():
     path, pose = random_pushes(SQUARE, 40, seed=5)
     x = jnp.asarray([TRUTH.get(name, 0.0) for name in objects.PRIOR])
     inputs = [jnp.asarray(y) for y in (path, pose, pose)]
-    fixed = objects._fixed(SQUARE, RADIUS)
+    fixed = objects._fixed(SQUARE, finger.uniform_pads(SQUARE), RADIUS)
     end = np.asarray(objects._simulate(x, fixed, *inputs)[0], float)
     end = end + np.random.default_rng(0).normal(size=end.shape) * [2e-4, 2e-4, 2e-3]
     return Pushes(path, pose, end)
