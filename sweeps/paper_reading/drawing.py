@@ -8,7 +8,7 @@ import xarray as xr
 from rps_jax.analysis.figures.style import Figure, shade
 from sweeps.paper_reading import evidence
 from sweeps.paper_reading.printed import NUMBERS
-from sweeps.paper_reading.unknowns import UNKNOWNS, coordinate
+from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS
 
 _COLOURS = {"prior": "0.75", "posterior": "C0", "left out": "C1"}
 _LABELS = {"prior": "prior", "posterior": "posterior", "left out": "predicted from the others"}
@@ -19,12 +19,11 @@ def posterior(results: xr.Dataset) -> Figure:
     """Draw the posterior of every unknown over its prior; a dashed line marks the closest draw."""
     weights, at = evidence.normalised(evidence.log_weights(results)), evidence.closest(results)
     figure = Figure(figsize=(13, 9.5), layout="constrained")
-    names = evidence.unknowns_of(results)
-    axes = figure.subplots(-(-len(names) // 6), 6).flat
-    for ax in axes[len(names) :]:
+    axes = figure.subplots(5, 6).flat
+    for ax in axes[len(NAMES) :]:
         ax.set_axis_off()
-    for ax, name in zip(axes, names, strict=False):
-        unknown, u = UNKNOWNS[name], coordinate(results.u.values, name)
+    for ax, name in zip(axes, NAMES, strict=False):
+        unknown, u = UNKNOWNS[name], results.u.sel(unknown=name).values
         count = len(unknown.choices) or _BINS
         shares, edges = np.histogram(u, count, (0, 1), weights=weights)
         ax.bar(edges[:-1], count * shares, 1 / count, align="edge", color="C0", ec="w", lw=0.5)

@@ -49,14 +49,6 @@ def _names(results: xr.Dataset) -> list[str]:
     return results.number.values.tolist()
 
 
-def unknowns_of(results: xr.Dataset) -> list[str]:
-    """Return the unknowns of which the numbers of the results can tell."""
-    if _cells(results):
-        return list(NAMES)
-    idle = {"rear", *(x for x in NAMES if x.startswith("aps_"))}
-    return [x for x in NAMES if UNKNOWNS[x].part != "simulation" and x not in idle]
-
-
 def _cells(results: xr.Dataset) -> list[str]:
     return [name for name in _names(results) if printed.part_of(name) == "Table II"]
 
@@ -91,21 +83,17 @@ def proposal(results: xr.Dataset) -> Proposal:
 def summary(results: xr.Dataset) -> str:
     """Return a sentence on draws, numbers and the effective number of draws."""
     weights = _of_simulations(results, normalised(log_weights(results)))
-    cells, several = _cells(results), results.sizes["draw"] // weights.size
-    drawn = f"the text and the simulation, each with {several} draws of the hardware"
-    inside = ""
-    if cells:
-        count = int(_matches(results, cells)[closest(results)])
-        inside = f" The closest draw has {count} of {len(cells)} cells of Table II inside the "
-        inside += "paper's Wilson intervals."
+    cells = _cells(results)
     return (
-        f"{weights.size:,} draws of {drawn if cells else 'the text and the hardware'}: "
-        f"{len(unknowns_of(results))} unknowns against {len(_names(results))} numbers and "
-        "observations of the paper; effective number of draws "
+        f"{weights.size:,} draws of the text and the simulation, each with "
+        f"{results.sizes['draw'] // weights.size} draws of the hardware: {len(NAMES)} unknowns "
+        f"against {len(NUMBERS)} numbers and observations of the paper; effective number of draws "
         f"{effective(weights):.0f}. A mean has a normal likelihood, with a standard deviation of "
         f"{1000 * printed.D:g} mm for D and {printed.TIME:g} s for times; a count a beta-binomial "
         "one; an observation in the text is wrong with a probability of "
-        f"{100 * printed.WRONG:g} %.{inside}"
+        f"{100 * printed.WRONG:g} %. The closest draw has "
+        f"{int(_matches(results, cells)[closest(results)])} of {len(cells)} cells of Table II "
+        "inside the paper's Wilson intervals."
     )
 
 
@@ -146,8 +134,8 @@ def unknowns_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each unknown: prior, posterior, and its value in the closest draw."""
     weights, at = normalised(log_weights(results)), closest(results)
     rows = [["part", "unknown", "prior", "posterior: median, 5 to 95 %", "the closest draw"]]
-    for name in unknowns_of(results):
-        unknown, u = UNKNOWNS[name], results.u.values
+    for name, unknown in UNKNOWNS.items():
+        u = results.u.values
         if unknown.choices:
             drawn = np.array(texts(u, name))
             share = _probability(results, weights, drawn == unknown.choices[1])
@@ -205,8 +193,7 @@ def numbers_table(results: xr.Dataset) -> list[list[str]]:
         inside = "yes" if agrees(name, ours) else "no"
         rows.append([name, _word(name, number.value), *cells, _word(name, ours), inside])
     weights = normalised(-results.log_proposal.values), normalised(log_weights(results))
-    counted = {"cells of Table II": _cells(results), "all of these": _names(results)}
-    for words, names in counted.items() if _cells(results) else ():
+    for words, names in (("cells of Table II", _cells(results)), ("all of these", _names(results))):
         matches = _matches(results, names)
         ranges = [_range(quantiles(matches, each), ".0f") for each in weights]
         of = f"{len(names)} of {len(names)}"

@@ -32,8 +32,7 @@ from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, aps_params, params, t
 Target = tuple[float, float]
 FIG_6: Target = (-2.0, 0.0)  # box, S1
 _POINT, _LINE = 1, 2  # types of contact
-# Quantities of the domain, of which each object has an unknown, and its prefix.
-_BY_OBJECT = {"friction_ground": "ground", "friction_robot": "robot", "support": "support"}
+_BY_OBJECT = {"friction_ground": "ground", "friction_robot": "robot"}  # in the name of an unknown
 _SIMULATED = {"yaw": "yaw", "gap": "sim_gap"}  # quantity of the domain: unknown
 _CORNER = (0.15, 0.25)  # [m] |l| of "0.2 m from the center"
 _HIGHEST = 0.9  # [1] share of eta from which a_r is "nearly at its highest value"
@@ -57,8 +56,8 @@ def _by_object(prefix: str) -> Range:
 HARDWARE: Domain = replace(
     parse_domain("hardware"),
     targets=paper.HARDWARE_LAYOUTS["circle"],
-    lateral=Range(-0.03, 0.03),  # by hand, within 3 cm and 3 degrees
-    yaw=Range(-0.0524, 0.0524),
+    lateral=Range(-0.02, 0.02),
+    yaw=Range(-0.05, 0.05),
     **{quantity: _by_object(prefix) for quantity, prefix in _BY_OBJECT.items()},
     **_ranges("hardware"),
 )

@@ -64,14 +64,12 @@ class PaperReading(TrialStudy[xr.Dataset]):
     """Number of repetitions of the hardware's experiments under the closest draw."""
     targets: tuple[Target, ...] = paper.TARGETS
     """Targets of the simulated trials [m]."""
-    hardware: bool = False
-    """Whether to run and weigh the numbers of the hardware alone."""
     setting: Setting = field(default=Setting("fused"), kw_only=True)
 
     def num_trials(self) -> int:
         """Number of trials of all draws."""
-        table = 0 if self.hardware else len(paper.LAWS) * 6 * len(self.targets) + 1
-        of_draw = 16 * self.samples + table
+        table = len(paper.LAWS) * 6 * len(self.targets)
+        of_draw = 16 * self.samples + table + 1
         return 16 * (self.first + 2 * self.repeats) + self.rounds * self.draws * of_draw
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -80,16 +78,15 @@ class PaperReading(TrialStudy[xr.Dataset]):
         run = run._replace(callback=progress)
         pilot = run.checkpoint("first", partial(self._draw_hardware, run))
         progress.finish(16 * self.first)
-        shared = 1 if self.hardware else self.samples
         proposals = [evidence.proposal(_joined([pilot], [Proposal.prior()], 1))]
         rounds: list[xr.Dataset] = []
         for index in range(self.rounds):
             if rounds:
-                proposals.append(evidence.proposal(_joined(rounds, proposals, shared)))
-            compute = partial(self._draw, proposals[-1], index + 1, run)
+                proposals.append(evidence.proposal(_joined(rounds, proposals, self.samples)))
+            compute = partial(self._draw, proposals[-1], index + 1, self.targets, run)
             rounds.append(run.checkpoint(f"round_{index}", compute))
             progress.finish((self.num_trials() - 16 * self.first) // self.rounds)
-        results = _joined(rounds, proposals, shared)
+        results = _joined(rounds, proposals, self.samples)
         closest = results.isel(draw=[evidence.closest(results)])
         checked = run.checkpoint("closest", partial(self._check, closest, run))
         return xr.merge([results, checked], combine_attrs="drop")
@@ -99,15 +96,14 @@ class PaperReading(TrialStudy[xr.Dataset]):
         u = Proposal.prior().sample(self.first, np.random.default_rng([self.setting.seed, 0]))
         return experiments.numbers(u, 1, self.setting, (), run, 0)
 
-    def _draw(self, proposal: Proposal, index: int, run: Run) -> xr.Dataset:
+    def _draw(
+        self, proposal: Proposal, index: int, targets: tuple[Target, ...], run: Run
+    ) -> xr.Dataset:
         """Return draws of a proposal and their numbers."""
         rng = np.random.default_rng([self.setting.seed, index])
-        if self.hardware:
-            u = proposal.sample(self.draws * self.samples, rng)
-            return experiments.numbers(u, 1, self.setting, (), run, index)
         once = proposal.sample(self.draws, rng)
         u = redraw_hardware(proposal, once, self.samples, rng)
-        return experiments.numbers(u, self.samples, self.setting, self.targets, run, index)
+        return experiments.numbers(u, self.samples, self.setting, targets, run, index)
 
     def _check(self, closest: xr.Dataset, run: Run) -> xr.Dataset:
         """Return the hardware's numbers of one draw in two engines, and its Fig. 6 over time."""
@@ -118,13 +114,10 @@ class PaperReading(TrialStudy[xr.Dataset]):
             found = experiments.hardware(u, setting, run, 1000)
             names = list(found)
             by_engine.append(np.stack([found[name] for name in names], 1))
+        trace = experiments.figure_6(closest.u.values, self.setting, run.callback)[0]
         columns = {"checked": (("engine", "repeat", "checked_number"), np.stack(by_engine))}
         coords = {"engine": ["fused", "mujoco"], "checked_number": names}
-        checked = xr.Dataset(columns, coords)
-        if self.hardware:
-            return checked
-        trace = experiments.figure_6(closest.u.values, self.setting, run.callback)[0]
-        return xr.merge([checked, trace], combine_attrs="drop")
+        return xr.merge([xr.Dataset(columns, coords), trace], combine_attrs="drop")
 
     def intro(self, results: xr.Dataset) -> str:
         """Describe the draws and the likelihood."""
@@ -132,40 +125,29 @@ class PaperReading(TrialStudy[xr.Dataset]):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return posterior, predictions, the closest draw and its Fig. 6."""
-        name = "hardware" if self.hardware else "reading"
-        of_all = Table(
-            evidence.readings_table(results),
-            name="reading_evidence",
-            title="Evidence for each reading",
-        )
-        predicted = Picture("predictions", partial(drawing.predictions, results))
-        tables = [
+        return [
+            Table(
+                evidence.readings_table(results),
+                name="reading_evidence",
+                title="Evidence for each reading",
+            ),
             Table(
                 evidence.unknowns_table(results),
-                name=f"{name}_posterior",
+                name="reading_posterior",
                 title="Posterior",
-                picture=Picture(
-                    "hardware_posterior" if self.hardware else "posterior",
-                    partial(drawing.posterior, results),
-                ),
+                picture=Picture("posterior", partial(drawing.posterior, results)),
             ),
             Table(
                 evidence.numbers_table(results),
-                name=f"{name}_numbers",
+                name="reading_numbers",
                 title="Printed numbers and their predictions",
-                picture=None if self.hardware else predicted,
+                picture=Picture("predictions", partial(drawing.predictions, results)),
             ),
             Table(
                 evidence.checks_table(results),
-                name=f"{name}_checks",
+                name="reading_checks",
                 title="The closest draw again, in two engines",
             ),
-        ]
-        if self.hardware:
-            return tables
-        return [
-            of_all,
-            *tables,
             Table(
                 evidence.figure_6_table(results),
                 name="reading_figure_6",

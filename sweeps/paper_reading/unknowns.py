@@ -46,10 +46,6 @@ UNKNOWNS: dict[str, Unknown] = {
     "ground_cylinder": Unknown("hardware", "friction cylinder-ground", Range(0.1, 0.8)),
     "robot_box": Unknown("hardware", "friction box-robot", Range(0.15, 1.2)),
     "robot_cylinder": Unknown("hardware", "friction cylinder-robot", Range(0.15, 1.2)),
-    # 0 even, 1 along the rim, 2 at the corners; a cylinder has none.
-    "support_box": Unknown("hardware", "pressure under the box", Range(0, 2)),
-    "support_cylinder": Unknown("hardware", "pressure under the cylinder", Range(0, 1)),
-    "slips": Unknown("hardware", "slips", choices=("three", "one for all")),
     "robot_slip": Unknown("hardware", "share of v_x that is lost", Range(0, 0.3)),
     "robot_slip_sideways": Unknown("hardware", "share of v_y that is lost", Range(0, 0.5)),
     "robot_slip_yaw": Unknown("hardware", "share of omega that is lost", Range(0, 0.6)),
@@ -68,21 +64,9 @@ NAMES = tuple(UNKNOWNS)
 _OF_RPS = tuple(name for name in RPSParams._fields if name in UNKNOWNS)
 
 
-def coordinate(u: np.ndarray, name: str) -> np.ndarray:
-    """Return the coordinate (n,) of an unknown at points u (n, q).
-
-    If one slip is for all axes, it is that of v_x.
-    """
-    column = u[:, NAMES.index(name)]
-    if name in ("robot_slip_sideways", "robot_slip_yaw"):
-        share = values(u, "robot_slip") / UNKNOWNS[name].range.high
-        column = np.where(values(u, "slips") > 0, share, column)
-    return column
-
-
 def values(u: np.ndarray, name: str) -> np.ndarray:
     """Return an unknown (n,) in its unit, or as the index of its choice, at points u (n, q)."""
-    unknown, column = UNKNOWNS[name], coordinate(u, name)
+    unknown, column = UNKNOWNS[name], u[:, NAMES.index(name)]
     if unknown.choices:
         return np.floor(column * len(unknown.choices))
     return unknown.range.at(column)

@@ -14,7 +14,8 @@ import contextlib
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -32,7 +33,7 @@ from rps_jax.questions import Run, call_of, option
 from rps_jax.tuning import objects
 from rps_jax.tuning.objects import PRIOR, Pushes
 from sweeps.real_pushes import pushes as triangle
-from sweeps.study_base import QuickStudy, Table, run_parts, text_table
+from sweeps.study_base import QuickStudy, Table, part_name, text_table
 
 RADIUS = 0.00475  # [m] of the finger
 LOGS, SHAPES = "mcube_data_proc/motion_model_eval_logs", "pnpush_matlab/get_shape.m"
@@ -62,6 +63,7 @@ UNSEEN = ("rect3", "tri1", "ellip3")
 _PRESSURES = list(PRIOR).index("camera_x")  # parameters of friction and pressure, the first ones
 _INSIDE = 4e-3  # [m] of the finger in the object at the start of a broken record
 _PUSHES = 700  # of a cell, at most
+_THREADS = 2
 METHODS = (
     "best published",
     "5 pushes",
@@ -185,7 +187,8 @@ class Mit(QuickStudy[xr.Dataset]):
     """Predict the pushes of each cell after fits to 5 and 20 random pushes, and to 20 %.
 
     Priors of few pushes are means and deviations of fits to 20 % of the pushes of other objects
-    on the same surface. The answer has errors `place` [m] and `turn` [rad] (cell, estimator, draw,
+    on the same surface. Intervals are as wide as 90 % of the errors of these objects need. The
+    answer has errors `place` [m] and `turn` [rad] (cell, estimator, draw,
     push) of all other pushes, and their ratios `place_ratio` and `turn_ratio` [1] to the radius of
     the interval of 90 %; NaN where there is none.
     """
@@ -210,14 +213,19 @@ class Mit(QuickStudy[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Fit each cell to 20 % of its pushes, and then to few with the prior of the others."""
-        shares = {
-            cell: run.checkpoint(f"share_{cell.replace(' ', '_')}", partial(self._share, cell))
-            for cell in self.cells
-        }
-        parts = {cell: partial(self._few, cell, shares) for cell in self.cells}
-        results = run_parts(run, "cell", parts)
-        share = xr.concat(shares.values(), xr.IndexVariable("cell", list(shares)))
-        return xr.merge([results, share[["mean"]]])
+        with ThreadPoolExecutor(_THREADS) as pool:
+
+            def parts_of(kind: str, compute: Callable[[str], xr.Dataset]) -> list[xr.Dataset]:
+                def part(cell: str) -> xr.Dataset:
+                    return run.checkpoint(f"{kind}_{part_name(cell)}", partial(compute, cell))
+
+                return list(pool.map(part, self.cells))
+
+            shares = dict(zip(self.cells, parts_of("share", self._share), strict=True))
+            by_cell = parts_of("few", lambda cell: self._few(cell, shares))
+        cells = xr.IndexVariable("cell", list(self.cells))
+        means = xr.concat(shares.values(), cells)[["mean"]]
+        return _scaled(xr.merge([xr.concat(by_cell, cells), means]))
 
     def _share(self, label: str) -> xr.Dataset:
         """Fit 20 % of the pushes of a cell with the default priors, and predict the others."""
@@ -247,8 +255,8 @@ class Mit(QuickStudy[xr.Dataset]):
 
     def _few(self, label: str, shares: Mapping[str, xr.Dataset]) -> xr.Dataset:
         """Return the errors (estimator, draw, push) of a cell."""
-        cell, (surface, name, _) = read(Path(self.data), label), label.split()
-        others = [x for x in shares if x.split()[0] == surface and x.split()[1] != name]
+        cell = read(Path(self.data), label)
+        others = _others(label, list(shares))
         prior = dict(PRIOR)
         if len(others) > 1:
             means = np.array([shares[x]["mean"].values for x in others])
@@ -317,6 +325,25 @@ _COLUMNS = {
 
 
 _ERRORS = ["place", "place_ratio", "turn", "turn_ratio"]
+
+
+def _others(label: str, cells: Sequence[str]) -> list[str]:
+    """Return the cells with other objects on the same surface."""
+    surface, name, _ = label.split()
+    return [x for x in cells if x.split()[0] == surface and x.split()[1] != name]
+
+
+def _scaled(results: xr.Dataset) -> xr.Dataset:
+    """Return results with ratios to intervals that hold 90 % of the pushes of other objects."""
+    results, cells = results.copy(deep=True), list(map(str, results.cell.values))
+    for name in ("place_ratio", "turn_ratio"):
+        ratio = results[name].copy(deep=True)
+        for i, label in enumerate(cells):
+            if others := _others(label, cells):
+                rest = ratio.sel(cell=others)
+                most = rest.quantile(0.9, ("cell", "draw", "push"))
+                results[name][i] = (ratio[i] / most).values
+    return results
 
 
 def _padded(columns: Mapping[str, np.ndarray]) -> xr.Dataset:
