@@ -132,6 +132,12 @@ def test_a_fit_finds_the_object_and_predicts_other_pushes(measured):
     assert len(fitted.feet) <= 16
 
 
+def test_an_object_on_known_feet_is_fitted(measured):
+    fitted = objects.fit(SQUARE, Pushes(*(x[:6] for x in measured)), RADIUS, feet=0.8 * SQUARE[:3])
+    assert_allclose(fitted.feet[:, :2], 0.8 * SQUARE[:3])
+    assert_allclose(fitted.feet[:, 2].sum(), 1.0, atol=1e-6)
+
+
 def table_of(pushes):
     """Return pushes as a table of the command."""
     rows = []
@@ -156,5 +162,9 @@ def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_
         rps_jax.fit_object(2 * SQUARE, table, RADIUS)
     with refusing("gap at the end"):
         rps_jax.fit_object(0.9 * SQUARE, table, RADIUS)
+    with refusing("without a contact at the end"):
+        rps_jax.fit_object(SQUARE, table.assign(tip_x=1.0 + table.tip_x), RADIUS)
+    with refusing("give 3 to 64 points"):
+        rps_jax.fit_object(SQUARE, table, RADIUS, feet=SQUARE[:2])
     with refusing("lack the column"):
         rps_jax.fit_object(SQUARE, table.drop(columns="yaw"), RADIUS)
