@@ -7,7 +7,6 @@ import signal
 from importlib import metadata
 from pathlib import Path
 
-import graph_verifier
 import pytest
 import shapes
 import tolerances
@@ -58,13 +57,13 @@ def pytest_configure(config):
     # A shell that starts pytest in the background lets it and its subprocesses ignore interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     shapes.install()
+    import graph_verifier  # and with it JAX, which reads the environment once
     import jax
 
     from rps_jax.engines import device
     from rps_jax.world import rendering
 
     graph_verifier.install()
-
     rendering.choose_gl()
     device.configure_xla()
     cache = config.rootpath / ".jax_cache"

@@ -282,7 +282,6 @@ def _import_mujoco() -> Any:
 @contextlib.contextmanager
 def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
     mujoco = _import_mujoco()
-    gl_context = mujoco.rendering.classic.gl_context
     width, height = (_FINER * n for n in size)
     buffer, quality = model.vis.global_, model.vis.quality
     with _OPENING:  # a film and stills of one model may be drawn on two threads
@@ -293,7 +292,8 @@ def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
             with warnings.catch_warnings():  # GLFW warns before it fails
                 warnings.simplefilter("ignore")
                 # Without a context, a renderer ends the process on some machines.
-                if not gl_context.GLContext(width, height)._context:
+                opened = mujoco.rendering.classic.gl_context.GLContext(width, height)
+                if not opened._context:
                     raise VideoError(_FIX_GL)
                 renderer = mujoco.Renderer(model, height=height, width=width)
         except Exception as error:  # of any kind, by OpenGL
