@@ -5,7 +5,8 @@
 Contact alone shows how the camera is placed against the robot and the markers on the object: at the
 end of a push the finger touches the outline. The pressure under the object is the exponential of a
 few smooth functions, and the push that ends at the measured pose has a friction. All are fitted
-together, with priors, to robust residuals (Cauchy).
+together, with priors, to robust residuals (Cauchy). A Gaussian process over the place and the
+direction of a push corrects what the fitted pushes leave nearby.
 """
 
 from __future__ import annotations
@@ -69,6 +70,10 @@ _INSIDE = 5e-3  # [m] of the finger in the object at the start, at most
 # errors over the scatter at 90 %, and the number of pushes that they count for in a fit.
 _SCATTER = {"place": (3e-4, 0.045), "turn": (5e-3, 0.075)}
 _QUANTILE, _PSEUDO = {"place": 2.75, "turn": 2.7}, 20
+# Lengths of the Gaussian process, from other objects: of the place of the finger, over the half size
+# of the object, of the direction of the push, and of that of the object. Variance of the noise over
+# its own, and residuals beyond which they are cut, over 1.5 times their median.
+_NEAR, _NOISE, _CUT = (0.3, 0.4, 1.0), 0.7, 3.0
 _FEW, _BATCH, _MOST = 32, 128, 512  # pushes of a small and a large batch, and of a fit at most
 _PADS, _CORNERS = 64, (8, 128)  # of an object, padded
 _COLUMNS = {"push": "", "time": "s", "x": "m", "y": "m", "yaw": "rad", "tip_x": "m", "tip_y": "m"}
@@ -181,6 +186,8 @@ class ObjectFit:
     radius: float  # [m] of the finger
     quantile: Mapping[str, float]  # of the errors over their scatter, at 90 %
     pads: np.ndarray  # (S, 4) of even pressure: x, y [m], share [1] and radius [m]
+    # Fitted pushes (n, 6) as of `_traits`, and their weights (n, 3) [m, m, rad] in other predictions
+    nearby: tuple[np.ndarray, np.ndarray] = (np.zeros((0, 6)), np.zeros((0, 3)))
 
     @property
     def friction(self) -> float:
@@ -207,6 +214,9 @@ class ObjectFit:
         pushes = read_pushes(pushes)
         pose, slope = self._pose_and_slope(pushes)
         scatter = _scatter(pose, slope, pushes.start, self.data.covariance.values)
+        fitted, weight = self.nearby
+        change = _kernel(_traits(self.outline, pushes), fitted) @ weight
+        pose = pose + solid.rotate(pushes.start[:, 2], change)
         radii = {name: ("push", self.quantile[name] * x) for name, x in scatter.items()}
         coords = {"axis": ["x", "y", "yaw"]}
         return xr.Dataset({"pose": (("push", "axis"), pose), **radii}, coords)
@@ -366,16 +376,39 @@ def fit(
     return fitted if np.isnan(data.end).any() else _calibrated(fitted, data)
 
 
+def _traits(outline: np.ndarray, pushes: Pushes) -> np.ndarray:
+    """Return coordinates (n, 6) of pushes between which a Gaussian process interpolates."""
+    yaw, way = -pushes.start[:, 2], pushes.path[:, -1] - pushes.path[:, 0]
+    way = way / np.maximum(np.linalg.norm(way, axis=1), 1e-9)[:, None]
+    at = (pushes.path[:, 0] - pushes.start[:, :2]) / (np.ptp(outline, axis=0).max() / 2)
+    turned = solid.rotate(yaw, at), solid.rotate(yaw, way), solid.unit(yaw)
+    return np.concatenate([x / near for x, near in zip(turned, _NEAR, strict=True)], axis=1)
+
+
+def _kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the correlation (n, m) of pushes (n, 6) and (m, 6)."""
+    return np.exp(-np.sum((a[:, None] - b) ** 2, axis=2) / 2)
+
+
 def _calibrated(fitted: ObjectFit, data: Pushes) -> ObjectFit:
-    """Return a fit whose quantiles also are those of its own pushes."""
+    """Return a fit whose predictions and quantiles also are those of its own pushes."""
     pose, slope = fitted._pose_and_slope(data)
     scatter = _scatter(pose, slope, data.start, fitted.data.covariance.values)
-    off, count = errors_of(pose, data.end), len(pose)
+    rest = data.end - pose
+    rest[:, 2] = solid.wrap(rest[:, 2])
+    rest, traits = solid.rotate(-data.start[:, 2], rest), _traits(fitted.outline, data)
+    most, count = _CUT * 1.5 * np.median(np.abs(rest), axis=0), len(pose)
+    inverse = np.linalg.inv(_kernel(traits, traits) + _NOISE * np.eye(count))
+    cut = np.clip(rest, -most, most)
+    weight = inverse @ cut
+    # Each push predicted from the others.
+    alone = rest - cut + weight / np.diag(inverse)[:, None]
+    off = errors_of(alone, np.zeros_like(alone))
     free = count / max(1.0, count - len(PRIOR) / 3)  # parameters take a part of each error
     own = {name: np.sqrt(free) * np.quantile(off[name] / scatter[name], 0.9) for name in off}
     share = count / (count + _PSEUDO)
     quantile = {name: (1 - share) * _QUANTILE[name] + share * own[name] for name in own}
-    return replace(fitted, quantile=quantile)
+    return replace(fitted, quantile=quantile, nearby=(traits, weight))
 
 
 _UNIT = 1e-3  # [m] scale of Cauchy's loss

@@ -102,20 +102,17 @@ class Support(QuickStudy[xr.Dataset]):
         names = points.names(HARDWARE)
         u = np.column_stack([at[x] if x in at else rng.random(count) for x in names])
         results = rps_jax.sweep("rps", HARDWARE, points=u).isel(law=0)
-        columns = {}
-        by = {"D": results.mean_abs_l.values, "time": results.time.values}
-        by["successes"] = np.where(results.success.values, 1.0, np.nan)
-        for name, x in by.items():
+        success = results.success.values
+        dims = ("slips", "object", "support", "friction", "target", "repeat")
+        columns: dict[str, xr.DataArray] = {}
+        for name, x in (("D", results.mean_abs_l), ("time", results.time), ("successes", success)):
             table = np.full(shape, np.nan)
-            table[tuple(index)] = np.where(results.success.values, x, np.nan)
-            trials = table.reshape(*shape[:4], -1)
-            columns[name] = np.nanmean(trials, axis=-1)
-            columns[f"{name}_variance"] = np.nanvar(trials, axis=-1)
-            if name == "successes":
-                columns[name] = np.nansum(trials, axis=-1) / trials.shape[-1]
-        dims = ("slips", "object", "support", "friction")
+            table[tuple(index)] = np.where(success | (name == "successes"), x, np.nan)
+            trials = xr.DataArray(table, dims=dims)
+            columns[name] = trials.mean(dims[4:])
+            columns[f"{name}_variance"] = trials.var(dims[4:])
         coords = {"object": ["box", "cylinder"], "friction": list(FRICTIONS)}
-        return xr.Dataset({k: (dims, x) for k, x in columns.items()}, coords)
+        return xr.Dataset(columns, coords)
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return success in random worlds, and the posterior of the hardware."""

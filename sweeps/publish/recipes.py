@@ -282,7 +282,9 @@ RECIPES: dict[str, Recipe] = {
         section="Grounds beside a rigid object",
     ),
     "straight": recipe(f"rps sweeps/ground/straight.py {_MACHINE}", cores=4),
-    "support*": recipe(f"rps sweeps/ground/support.py --worlds 120 {_MACHINE}", cores=1),
+    "support*": recipe(
+        f"rps sweeps/ground/support.py --worlds 1000 --repeats 6 {_MACHINE}", cores=1
+    ),
     "force_push_grid": recipe("rps sweeps/force_push_grid", cores=4, section="Pushes that succeed"),
     "mends": recipe(
         *_each("rps sweeps/mends --domain {} --worlds 4096 --seed 80", *_WIDE[::-1]),
