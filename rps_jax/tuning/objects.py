@@ -70,9 +70,9 @@ _INSIDE = 5e-3  # [m] of the finger in the object at the start, at most
 # errors over the scatter at 90 %, and the number of pushes that they count for in a fit.
 _SCATTER = {"place": (3e-4, 0.045), "turn": (5e-3, 0.075)}
 _QUANTILE, _PSEUDO = {"place": 2.75, "turn": 2.7}, 20
-# Lengths of the Gaussian process, from other objects: of the place of the finger, over the half size
+# Lengths of the Gaussian process, from other objects: of the place of the finger over the half size
 # of the object, of the direction of the push, and of that of the object. Variance of the noise over
-# its own, and residuals beyond which they are cut, over 1.5 times their median.
+# that of the process, and residuals beyond which they are cut, over 1.5 times their median.
 _NEAR, _NOISE, _CUT = (0.3, 0.4, 1.0), 0.7, 3.0
 _FEW, _BATCH, _MOST = 32, 128, 512  # pushes of a small and a large batch, and of a fit at most
 _PADS, _CORNERS = 64, (8, 128)  # of an object, padded
@@ -186,7 +186,7 @@ class ObjectFit:
     radius: float  # [m] of the finger
     quantile: Mapping[str, float]  # of the errors over their scatter, at 90 %
     pads: np.ndarray  # (S, 4) of even pressure: x, y [m], share [1] and radius [m]
-    # Fitted pushes (n, 6) as of `_traits`, and their weights (n, 3) [m, m, rad] in other predictions
+    # Fitted pushes (n, 6) as of `_traits`, and their weights (n, 3) [m, m, rad] for other pushes
     nearby: tuple[np.ndarray, np.ndarray] = (np.zeros((0, 6)), np.zeros((0, 3)))
 
     @property
