@@ -1,5 +1,7 @@
 """Pushes by one round finger, and objects that are fitted to them."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,7 @@ import rps_jax
 from rps_jax.engines import finger
 from rps_jax.engines.finger import Slider
 from rps_jax.tuning import objects
-from rps_jax.tuning.objects import Pushes
+from rps_jax.tuning.objects import ObjectFit, Pushes
 
 RADIUS, FRICTION = 0.005, 0.3
 SQUARE = np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]])
@@ -130,6 +132,17 @@ def test_a_fit_finds_the_object_and_predicts_other_pushes(measured):
     assert np.mean(off["place"] < predicted.place.values) > 0.7
     assert fitted.feet.shape[1] == 5
     assert len(fitted.feet) <= 16
+
+
+def test_what_the_model_leaves_corrects_pushes_nearby(measured):
+    few = Pushes(*(x[:12].copy() for x in measured))
+    few.end[0, 0] += 2e-3
+    fitted = objects.fit(SQUARE, few, RADIUS)
+    without = replace(fitted, nearby=ObjectFit.nearby)
+    change = (fitted.predict(few).pose - without.predict(few).pose).values
+    assert change[0, 0] > 3 * np.median(np.abs(change[1:, 0]))
+    far = Pushes(few.path + 1.0, few.start, few.end)
+    assert_allclose(fitted.predict(far).pose, without.predict(far).pose, atol=1e-9)
 
 
 def test_an_object_on_known_feet_is_fitted(measured):
