@@ -109,12 +109,12 @@ def push(
     The leaves of `slider` may have a leading axis B. The finger goes straight between points of a
     path, at any speed.
     """
-    own = Slider(
-        *(x if jnp.ndim(x) > rank else None for x, rank in zip(slider, (2, 2, 0, 0), strict=True))
+    own: Any = tuple(
+        x if jnp.ndim(x) > rank else None for x, rank in zip(slider, (2, 2, 0, 0), strict=True)
     )
 
     def push_one(inputs: tuple) -> Pushed:
-        leaves = (a if b is None else b for a, b in zip(slider, inputs[0], strict=True))
+        leaves = [a if b is None else b for a, b in zip(slider, inputs[0], strict=True)]
         return _push(Slider(*leaves), *inputs[1:], steps=steps)
 
     with trace_one_world():

@@ -58,7 +58,7 @@ def scene_of(case: Case, setting: Setting, index: int = 0) -> Scene:
 
 
 def title_of(case: Case, at: Scene) -> str:
-    """Return the title of a case, with what is guessed of its object."""
+    """Return the title of a case, with the guessed size and mass of its object."""
     if objects.guesses_of(case.object_name) is None:
         return case.title
     sizes = [*2 * at.solid.vertices[0], float(at.solid.height)]

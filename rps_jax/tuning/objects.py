@@ -74,7 +74,11 @@ _QUANTILE, _PSEUDO = {"place": 2.75, "turn": 2.7}, 20
 # of the object, of the direction of the push, and of that of the object. Variance of the noise over
 # that of the process, and residuals beyond which they are cut, over 1.5 times their median.
 _NEAR, _NOISE, _CUT = (0.3, 0.4, 1.0), 0.7, 3.0
-_FEW, _BATCH, _MOST = 32, 128, 512  # pushes of a small and a large batch, and of a fit at most
+_SMALL_BATCH, _BATCH, _MAX_PUSHES = (
+    32,
+    128,
+    512,
+)  # pushes of a small and a large batch, and of a fit at most
 _PADS, _CORNERS = 64, (8, 128)  # of an object, padded
 _COLUMNS = {"push": "", "time": "s", "x": "m", "y": "m", "yaw": "rad", "tip_x": "m", "tip_y": "m"}
 
@@ -271,7 +275,7 @@ def _batched(
     for first in range(0, len(pushes.path), _BATCH):
         part = [np.asarray(y, float)[first : first + _BATCH] for y in pushes]
         count = len(part[0])
-        missing = (_FEW if count <= _FEW else _BATCH) - count
+        missing = (_SMALL_BATCH if count <= _SMALL_BATCH else _BATCH) - count
         part = [jnp.asarray(np.concatenate([y, np.repeat(y[-1:], missing, 0)])) for y in part]
         outputs = function(jnp.asarray(x), fixed, *part)
         parts.append([np.asarray(y, float)[:count] for y in outputs])
@@ -317,8 +321,8 @@ def fit(
     if count < 3:
         raise errors.not_allowed("pushes", count, "give 3 or more, better 5")
     mean, deviation = np.array([{**PRIOR, **prior}[name] for name in PRIOR]).T
-    if count > _MOST:
-        raise errors.not_allowed("pushes", count, f"give at most {_MOST}")
+    if count > _MAX_PUSHES:
+        raise errors.not_allowed("pushes", count, f"give at most {_MAX_PUSHES}")
     pads = finger.uniform_pads(corners) if feet is None else _pads_of(feet)
     fixed, size = _fixed(corners, pads, radius), float(np.ptp(corners, axis=0).max()) / 2
     first = _batched(_simulate, mean, fixed, data)[1]
@@ -391,15 +395,15 @@ def _kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _calibrated(fitted: ObjectFit, data: Pushes) -> ObjectFit:
-    """Return a fit whose predictions and quantiles also are those of its own pushes."""
+    """Return a fit that also learns corrections and quantiles from the fitted pushes."""
     pose, slope = fitted._pose_and_slope(data)
     scatter = _scatter(pose, slope, data.start, fitted.data.covariance.values)
     rest = data.end - pose
     rest[:, 2] = solid.wrap(rest[:, 2])
     rest, traits = solid.rotate(-data.start[:, 2], rest), _traits(fitted.outline, data)
-    most, count = _CUT * 1.5 * np.median(np.abs(rest), axis=0), len(pose)
+    limit, count = _CUT * 1.5 * np.median(np.abs(rest), axis=0), len(pose)
     inverse = np.linalg.inv(_kernel(traits, traits) + _NOISE * np.eye(count))
-    cut = np.clip(rest, -most, most)
+    cut = np.clip(rest, -limit, limit)
     weight = inverse @ cut
     # Each push predicted from the others.
     alone = rest - cut + weight / np.diag(inverse)[:, None]

@@ -110,8 +110,8 @@ def draw_guesses(name: str, u: Arrays) -> Solid | None:
     """
     if (ranges := guesses_of(name)) is None:
         return None
-    numbers = np.stack([u[x] for x in ("size", "aspect", "height", "mass")])
-    depth, breadth, height, mass = ranges[:, :1] + np.diff(ranges) * numbers
+    shares = np.stack([u[x] for x in ("size", "aspect", "height", "mass")])
+    depth, breadth, height, mass = ranges[:, :1] + np.diff(ranges) * shares
     zero = np.zeros_like(mass)
     outlines = solid.rectangles(depth / 2, breadth / 2)
     return solid.build(outlines, zero, height, mass, zero, zero, zero)

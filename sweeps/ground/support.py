@@ -178,8 +178,9 @@ def posterior(results: xr.Dataset) -> xr.DataArray:
     by_object = xr.apply_ufunc(
         lambda x: logsumexp(x, axis=(-2, -1)), fit, input_core_dims=[["support", "friction"]]
     )
-    one = np.arange(len(SLIPS)) < len(ONE_SLIP)
-    prior = xr.DataArray(-np.log(np.where(one, len(ONE_SLIP), len(THREE_SLIPS))), dims="slips")
+    is_equal = np.arange(len(SLIPS)) < len(ONE_SLIP)
+    counts = np.where(is_equal, len(ONE_SLIP), len(THREE_SLIPS))
+    prior = xr.DataArray(-np.log(counts), dims="slips")
     of_slips = by_object.sum("object") + prior
     of_slips = np.exp(of_slips - logsumexp(of_slips))
     return of_slips * np.exp(fit - by_object.where(np.isfinite(by_object), 0))
@@ -190,19 +191,19 @@ def marginals(results: xr.Dataset) -> dict[str, dict[str, float]]:
     p = posterior(results)
     of_slips = p.isel(object=0).sum(("support", "friction")).values
     axes = {f"share of {x} that is lost": i for i, x in enumerate(("v_x", "v_y", "omega"))}
-    one = float(of_slips[: len(ONE_SLIP)].sum())
-    found = {"slips": {"one for all axes": one, "three": 1 - one}}
+    equal = float(of_slips[: len(ONE_SLIP)].sum())
+    unknowns = {"slips": {"one for all axes": equal, "three": 1 - equal}}
     for label, i in axes.items():
         values = sorted({slip[i] for slip in SLIPS})
-        shares = [of_slips[[slip[i] == x for slip in SLIPS]].sum() for x in values]
-        found[label] = dict(zip(map("{:g}".format, values), map(float, shares), strict=True))
+        totals = [of_slips[[slip[i] == x for slip in SLIPS]].sum() for x in values]
+        unknowns[label] = dict(zip(map("{:g}".format, values), map(float, totals), strict=True))
     for name, label in (("support", "pressure under the"), ("friction", "friction robot-")):
         for kind in map(str, p.object.values):
-            other = "friction" if name == "support" else "support"
-            each = p.sel(object=kind).sum(("slips", other))
+            summed = "friction" if name == "support" else "support"
+            shares = p.sel(object=kind).sum(("slips", summed))
             text = f"{label} {kind}" if name == "support" else f"{label}{kind}"
-            found[text] = dict(zip(map(str, p[name].values), map(float, each), strict=True))
-    return found
+            unknowns[text] = dict(zip(map(str, p[name].values), map(float, shares), strict=True))
+    return unknowns
 
 
 def _posterior_rows(results: xr.Dataset) -> Iterator[dict[str, object]]:
@@ -217,16 +218,16 @@ def readings(results: xr.Dataset) -> dict[str, tuple[tuple[int, ...], ...]]:
     best = fit.max(("support", "friction")).sum("object").values
     same = fit.max("friction").sum("object").max("support").values
     starts = {"one slip": (0, len(ONE_SLIP)), "three slips": (len(ONE_SLIP), len(SLIPS))}
-    found = {}
+    points_of = {}
     for label, (low, high) in starts.items():
         slips = low + int(best[low:high].argmax())
-        each = [np.unravel_index(int(np.argmax(x)), x.shape) for x in fit.values[slips]]
-        found[label] = tuple((slips, *map(int, x)) for x in each)
+        best_points = [np.unravel_index(int(np.argmax(x)), x.shape) for x in fit.values[slips]]
+        points_of[label] = tuple((slips, *map(int, x)) for x in best_points)
     slips = int(same.argmax())
     support = int(fit[slips].max("friction").sum("object").values.argmax())
     frictions = fit.values[slips, :, support].argmax(axis=1)
-    found["one pressure for both"] = tuple((slips, support, int(x)) for x in frictions)
-    return found
+    points_of["one pressure for both"] = tuple((slips, support, int(x)) for x in frictions)
+    return points_of
 
 
 def _reading_rows(results: xr.Dataset) -> Iterator[dict[str, object]]:

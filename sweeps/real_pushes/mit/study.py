@@ -162,8 +162,8 @@ def _clean_split(folder: Path, label: str, cell: Cell) -> tuple[Cell, np.ndarray
         )
         for x in (test.pushes, cell.pushes)
     ]
-    apart = np.linalg.norm(middles[0][:, None] - middles[1], axis=2)
-    rows = linear_sum_assignment(apart)[1]
+    distance = np.linalg.norm(middles[0][:, None] - middles[1], axis=2)
+    rows = linear_sum_assignment(distance)[1]
     return test, np.setdiff1d(np.arange(len(cell.published)), rows)
 
 
@@ -230,21 +230,21 @@ class Mit(QuickStudy[xr.Dataset]):
     def _share(self, label: str) -> xr.Dataset:
         """Fit 20 % of the pushes of a cell with the default priors, and predict the others."""
         cell = read(Path(self.data), label)
-        few, rest = np.split(_order(cell, 0), [len(cell.published) // 5])
-        errors, fitted = self._predicted(cell, few, _chosen(cell.pushes, rest), PRIOR)
+        training, rest = np.split(_order(cell, 0), [len(cell.published) // 5])
+        errors, fitted = self._predicted(cell, training, _chosen(cell.pushes, rest), PRIOR)
         assert fitted is not None
         return errors.assign(mean=fitted.data["mean"])
 
     def _predicted(
-        self, cell: Cell, few: np.ndarray, test: Pushes, prior: Mapping
+        self, cell: Cell, training: np.ndarray, test: Pushes, prior: Mapping
     ) -> tuple[xr.Dataset, Any]:
         """Return errors (push) of test pushes after a fit to a few of a cell, and any fit."""
-        chosen, fitted = _chosen(cell.pushes, _unbroken(cell, few)), None
-        given = {"feet": cell.feet, "progress": False}
+        chosen, fitted = _chosen(cell.pushes, _unbroken(cell, training)), None
+        options: Any = {"feet": cell.feet, "progress": False}
         for tried in (prior, PRIOR):  # the gaps may not fit the prior of the others
             with contextlib.suppress(InputError):
                 fitted = fitted or fit_object(
-                    cell.outline, chosen, cell.radius, prior=tried, **given
+                    cell.outline, chosen, cell.radius, prior=tried, **options
                 )
         if fitted is None:  # refused
             return _padded(dict.fromkeys(_ERRORS, np.full(1, np.nan))), None
@@ -256,7 +256,7 @@ class Mit(QuickStudy[xr.Dataset]):
     def _few(self, label: str, shares: Mapping[str, xr.Dataset]) -> xr.Dataset:
         """Return the errors (estimator, draw, push) of a cell."""
         cell = read(Path(self.data), label)
-        others = _others(label, list(shares))
+        others = _other_objects(label, list(shares))
         prior = dict(PRIOR)
         if len(others) > 1:
             means = np.array([shares[x]["mean"].values for x in others])
@@ -268,20 +268,20 @@ class Mit(QuickStudy[xr.Dataset]):
         for count in (5, 20):
             draws = []
             for draw in range(self.draws):
-                few, rest = np.split(_order(cell, draw), [count])
-                draws.append(self._predicted(cell, few, _chosen(cell.pushes, rest), prior)[0])
-            by_method.append(xr.concat(draws, "draw"))
+                training, rest = np.split(_order(cell, draw), [count])
+                draws.append(self._predicted(cell, training, _chosen(cell.pushes, rest), prior)[0])
+            by_method.append(xr.concat(draws, xr.IndexVariable("draw", range(self.draws))))
         published = _padded(objects.errors_of(cell.published, cell.pushes.end))
         parts = [
-            published.expand_dims("draw"),
+            published.expand_dims(draw=[0]),
             *by_method,
-            shares[label][_ERRORS].expand_dims("draw"),
+            shares[label][_ERRORS].expand_dims(draw=[0]),
         ]
         if label.endswith(" 10"):
             test, training = _clean_split(Path(self.data), label, cell)
             theirs = _padded(objects.errors_of(test.published, test.pushes.end))
             ours = self._predicted(cell, training, test.pushes, PRIOR)[0]
-            parts += [theirs.expand_dims("draw"), ours.expand_dims("draw")]
+            parts += [theirs.expand_dims(draw=[0]), ours.expand_dims(draw=[0])]
         methods = list(METHODS[: len(parts)])
         joined = xr.concat(parts, xr.IndexVariable("estimator", methods), join="outer")
         return joined.reindex(estimator=list(METHODS))
@@ -290,14 +290,14 @@ class Mit(QuickStudy[xr.Dataset]):
         """Return errors by group of cells, and by cell."""
         labels = list(map(str, results.cell.values))
         developed = [x for x in labels if x.startswith("abs") and x.split()[1] not in UNSEEN]
-        own = [x for x in labels if x in TRIANGLE_CELLS]
+        triangles = [x for x in labels if x in TRIANGLE_CELLS]
         groups = {
-            "all": [x for x in labels if x not in own],
+            "all": [x for x in labels if x not in triangles],
             "abs, developed on": developed,
             "abs, other objects": [x for x in labels if x[0] == "a" and x not in developed],
             "plywood": [x for x in labels if x.startswith("plywood")],
-            "triangle of CMU on three feet": [x for x in own if "flat" not in x],
-            "triangle of CMU, flat": [x for x in own if "flat" in x],
+            "triangle of CMU on three feet": [x for x in triangles if "flat" not in x],
+            "triangle of CMU, flat": [x for x in triangles if "flat" in x],
         }
         rows = [
             row for name, cells in groups.items() if cells for row in _rows(results, name, cells)
@@ -327,7 +327,7 @@ _COLUMNS = {
 _ERRORS = ["place", "place_ratio", "turn", "turn_ratio"]
 
 
-def _others(label: str, cells: Sequence[str]) -> list[str]:
+def _other_objects(label: str, cells: Sequence[str]) -> list[str]:
     """Return the cells with other objects on the same surface."""
     surface, name, _ = label.split()
     return [x for x in cells if x.split()[0] == surface and x.split()[1] != name]
@@ -339,10 +339,10 @@ def _scaled(results: xr.Dataset) -> xr.Dataset:
     for name in ("place_ratio", "turn_ratio"):
         ratio = results[name].copy(deep=True)
         for i, label in enumerate(cells):
-            if others := _others(label, cells):
+            if others := _other_objects(label, cells):
                 rest = ratio.sel(cell=others)
-                most = rest.quantile(0.9, ("cell", "draw", "push"))
-                results[name][i] = (ratio[i] / most).values
+                limit = rest.quantile(0.9, ("cell", "draw", "push"))
+                results[name][i] = (ratio[i] / limit).values
     return results
 
 
