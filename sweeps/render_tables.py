@@ -79,8 +79,6 @@ STALE: dict[str, str] = {
             "pose",
             "pose_failures",
             "pose_parity",
-            "support",
-            "support_hardware",
         ),
         "a sum in the solver got its former order back, with other last bits",
     ),

@@ -141,8 +141,8 @@ class View(Command[None], Case):
         """The push that the page asks for."""
         case = dataclasses.replace(self.case, **request._asdict())
         live = Live(pushes.build([case], self.setting), self.setting)
-        scene = pushes.scene_of(case, self.setting.physics)
-        return Push(live, scene, f"{case.title}, {request.law}")
+        scene = pushes.scene_of(case, self.setting)
+        return Push(live, scene, f"{pushes.title_of(case, scene)}, {request.law}")
 
 
 view = call_of(View)

@@ -302,8 +302,9 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     def answer(self, run: Run) -> Trace:
         case, setting = self.case, self.setting
         trajectory = self.record(pushes.build([case], setting), setting, run)
-        scene = pushes.scene_of(case, setting.physics)
-        named = {"scene": scene, "title": case.title, "engine": setting.engine}
+        scene = pushes.scene_of(case, setting)
+        title = pushes.title_of(case, scene)
+        named = {"scene": scene, "title": title, "engine": setting.engine}
         return Trace(**vars(trajectory), **named, attrs=self.attributes())
 
 

@@ -26,9 +26,8 @@ from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progr
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
 from rps_jax.trials.worlds import BatchOptions, Job, WorldBatch, rows
-from rps_jax.world import draws, scene
+from rps_jax.world import draws, objects, scene
 from rps_jax.world.objects import FAMILIES
-from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene, WorldInputs
 from rps_jax.world.tasks.base import CourseInputs
 
@@ -49,10 +48,22 @@ class Trajectory:
         return float(x), float(y)
 
 
-def scene_of(case: Case, physics: Physics) -> Scene:
-    """Compile the scene of a case."""
+def scene_of(case: Case, setting: Setting, index: int = 0) -> Scene:
+    """Compile the scene of a case; (setting.world_seed, index) draws what its object guesses."""
     options = {"rear": case.rear, "mass": case.mass, "robot": case.base}
-    return scene.load(case.object_name, physics, case.contact, **options)
+    numbers = draws.numbers(setting.world_seed, np.array([index]))
+    drawn = objects.draw_guesses(case.object_name, numbers)
+    options["drawn"] = None if drawn is None else rows(drawn, 0)
+    return scene.load(case.object_name, setting.physics, case.contact, **options)
+
+
+def title_of(case: Case, at: Scene) -> str:
+    """Return the title of a case, with the guessed size and mass of its object."""
+    if objects.guesses_of(case.object_name) is None:
+        return case.title
+    sizes = [*2 * at.solid.vertices[0], float(at.solid.height)]
+    size, mass = " x ".join(f"{x:.2f}" for x in sizes), float(at.solid.mass)
+    return f"{case.title}, guessed {size} m and {mass:.1f} kg"
 
 
 def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -80,9 +91,13 @@ def build(
     trials = np.arange(len(cases)) if indices is None else np.asarray(indices)
     for case in cases:
         setting.check_here(case.base, [case.params])
-    keys = [(case.object_name, case.mass, case.rear, case.base) for case in cases]
+    guessed = {x for x in {x.object_name for x in cases} if objects.guesses_of(x) is not None}
+    keys = [
+        (case.object_name, case.mass, case.rear, case.base, i * (case.object_name in guessed))
+        for case, i in zip(cases, trials.tolist(), strict=True)
+    ]
     different = dict(zip(keys, cases, strict=True))
-    scenes = {key: scene_of(case, setting.physics) for key, case in different.items()}
+    scenes = {key: scene_of(case, setting, key[-1]) for key, case in different.items()}
     traced = setting.simulator.traced
     solids = {key: x.rounded_solid if traced else x.solid for key, x in scenes.items()}
     starts = [_start_of(case, scenes[key]) for case, key in zip(cases, keys, strict=True)]

@@ -131,6 +131,7 @@ def load(
     rear: Side = "near",  # side of the nonuniform box's load, the paper's "rear left corner"
     mass: float | None = None,  # [kg], scales the inertia too; None: the object's own mass
     robot: Robot = Robot(),  # a body if its force is limited
+    drawn: Solid | None = None,  # of an object with guesses (leaves without a leading axis)
 ) -> Scene:
     """Compile a scene of an object.
 
@@ -141,13 +142,15 @@ def load(
     errors.check_name("rear", rear, get_args(Side))
     check_contact(friction, mass)
     spec = objects.read(path_of(name))
-    if name in objects.REGISTERED:  # its contacts are those of its solid
-        single = objects.REGISTERED[name].solid
+    if name in objects.REGISTERED or drawn is not None:  # its contacts are those of its solid
+        single = objects.REGISTERED[name].solid if drawn is None else drawn
         if mass is not None:
             inertia = single.inertia * mass / single.mass
             single = single._replace(mass=np.asarray(mass), inertia=inertia)
         upright = compile_solid(FAMILIES[name], single, physics, friction, robot=robot)
         _set_robot(spec, robot)
+        if drawn is not None:
+            _resize(spec, drawn)
         return upright._replace(name=name, model=spec.compile())
     for geom in spec.geoms:
         if geom.name == "load" and rear == "far":
@@ -229,6 +232,15 @@ def base_invweight(robots: Robot) -> np.ndarray:
     It is the mean over x, y and z of the acceleration by a force of 1 N; along z the base is fixed.
     """
     return 2 / (3 * np.asarray(robots.mass, float))
+
+
+def _resize(spec: mujoco.MjSpec, box: Solid) -> None:
+    """Stretch the geoms of an object, of which the geom `object` is a box, to another box."""
+    body, half = spec.body("object"), np.append(box.vertices[0], box.height / 2)
+    ratio = half / spec.geom("object").size
+    body.pos[2] = half[2]
+    for geom in body.geoms:
+        geom.pos, geom.size = geom.pos * ratio, geom.size * ratio
 
 
 def geom_sizes(family: str, solids: Solid) -> Arrays:
@@ -459,6 +471,8 @@ def solid_of(scene: Scene) -> Solid:
 
 def width_of(name: str) -> float:
     """Return the greatest width of an object of a scene along its axes [m]."""
+    if (ranges := objects.guesses_of(name)) is not None:
+        return float(ranges[:2].max())
     shape = solid_of(load(name))
     return 2 * float(np.abs(shape.vertices).max() + shape.radius.max())
 

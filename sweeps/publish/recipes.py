@@ -283,7 +283,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "straight": recipe(f"rps sweeps/ground/straight.py {_MACHINE}", cores=4),
     "support*": recipe(
-        f"rps sweeps/ground/support.py --worlds 120 --hardware 16 {_MACHINE}", cores=1
+        f"rps sweeps/ground/support.py --worlds 1000 --repeats 6 {_MACHINE}", cores=1
     ),
     "force_push_grid": recipe("rps sweeps/force_push_grid", cores=4, section="Pushes that succeed"),
     "mends": recipe(
