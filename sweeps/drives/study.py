@@ -1,6 +1,6 @@
 """Bases that cannot move sideways: success and time by drive, axle and domain, in equal worlds.
 
-rps sweeps/drives --worlds 10000
+rps sweeps/drives
 """
 
 from __future__ import annotations
@@ -76,6 +76,8 @@ class Drives(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
     """Names of domains, or of tasks in `wide`: paths, corridors of 2 m with a lookahead."""
     worlds: int = option(10000, 2, 10_000_000)
     """Number of worlds of each domain."""
+    file: str = "drives"
+    """Name of the data file."""
     setting: Setting = field(default=Setting("fused", seed=9241), kw_only=True)
 
     @cached_property
@@ -109,7 +111,8 @@ class Drives(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return success and times of each row."""
         limit = float(self.setting.rules.max_lost)
-        return [Table(drive_table(results, limit), name="drives", merge="domain", title="Drives")]
+        table = drive_table(results, limit)
+        return [Table(table, name=self.file, merge="domain", title="Drives")]
 
 
 drives = call_of(Drives)
