@@ -335,7 +335,7 @@ RECIPES: dict[str, Recipe] = {
         "rps learn --robot ideal,drive=differential --domain wide --num-envs 1024 --drawn 8192 "
         "--horizon 180 --max-lost 60 --discount-time 60 --gae-time 10 --minutes 6.2 "
         "--out runs/learn_differential",
-        "rps sweep --domain wide --robot ideal,drive=differential --worlds 2000 --seed 9242 "
+        "rps sweep --domain wide --robot ideal,drive=differential --worlds 1000 --seed 9242 "
         "--laws unicycle runs/learn_differential/policy.npz --out runs/learned_differential",
         gpu=8,
         section="Success",
