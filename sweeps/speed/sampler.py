@@ -12,7 +12,7 @@ import runpy
 import sys
 import threading
 import time
-from collections import Counter
+from collections import defaultdict
 from types import FrameType
 
 PERIOD = 0.005  # [s] between samples
@@ -33,7 +33,7 @@ def names_of(frame: FrameType | None) -> tuple[str, ...]:
     return tuple(reversed(names))
 
 
-def sample(thread: int, seconds: Counter[tuple[str, ...]]) -> None:
+def sample(thread: int, seconds: dict[tuple[str, ...], float]) -> None:
     """Add the time since the last sample to the present stack of a thread, until Python ends."""
     last = time.perf_counter()
     while True:
@@ -47,7 +47,7 @@ def main() -> None:
     """Run the command, and sample the thread that runs it."""
     file, *arguments = sys.argv[1:]
     del sys.path[0]  # the folder of this file
-    begun, seconds = time.time(), Counter[tuple[str, ...]]()
+    begun, seconds = time.time(), defaultdict[tuple[str, ...], float](float)
 
     def write() -> None:
         """Write the samples."""

@@ -90,7 +90,7 @@ stages = call_of(Stages)
 def divided(command: str, limit: float) -> xr.Dataset:
     """Return the seconds (stage,) of the second run of a command."""
     with tempfile.TemporaryDirectory() as folder:
-        samples = Path(folder, "samples.json")
+        samples, started, ended = Path(folder, "samples.json"), 0.0, 0.0
         for i in range(2):
             words = [str(SAMPLER), str(samples), *shlex.split(command), "--out", f"{folder}/{i}"]
             started = time.time()
