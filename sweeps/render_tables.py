@@ -82,7 +82,6 @@ STALE: dict[str, str] = {
         ),
         "a sum in the solver got its former order back, with other last bits",
     ),
-    "drives_engines": "`unicycle` turned during its retreats",
 }
 NUMBERS = SWEEPS / "publish" / "numbers.json"
 _NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"

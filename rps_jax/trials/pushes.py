@@ -40,6 +40,7 @@ class Trajectory:
     outcome: Outcome  # without a leading axis
     world: World  # without a leading axis
     params: LawParams
+    law_states: Pytree  # (T, ...) what the law remembers at the snapshots
 
     @property
     def p_world_target(self) -> tuple[float, float]:
@@ -210,18 +211,18 @@ def record_batch(
 ) -> list[Trajectory]:
     """Run trials of one stage as `watch` does, with a snapshot every `interval` [s]."""
     period, start_time, compile_time = setting.physics.control_period, time.perf_counter(), None
-    moments = list[tuple[Trial, Snapshot, Outcome]]()
-    for moment in watch(worlds, setting, law, interval=interval, slots=slots):
+    moments, ends = list[tuple[Snapshot, Pytree]](), list[Outcome]()
+    for trials, snapshot, outcome in watch(worlds, setting, law, interval=interval, slots=slots):
+        ends = [outcome]
         compile_time = compile_time or time.perf_counter() - start_time  # of the first snapshot
-        moments.append(moment)
-        simulated = float(moment[0].steps.sum()) * period
-        callback(Progress(int(moment[0].done.sum()), simulated, compile_time))
-    _, snapshots, outcomes = zip(*moments, strict=True)
-    columns = jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots)
-    fields = outcomes[-1], *worlds.inputs
-    return [  # with snapshots until the end of each trial
-        Trajectory(rows(columns, (~columns.done[:, i], i)), *rows(fields, i))
-        for i in range(worlds.indices.size)
+        moments.append((snapshot, jax.device_get(trials.law_state)))
+        simulated = float(trials.steps.sum()) * period
+        callback(Progress(int(trials.done.sum()), simulated, compile_time))
+    columns, states = jax.tree.map(lambda *leaves: np.stack(leaves), *moments)
+    recorded = [(~columns.done[:, i], i) for i in range(worlds.indices.size)]  # until their ends
+    fields = *ends, *worlds.inputs
+    return [
+        Trajectory(rows(columns, at), *rows(fields, at[1]), rows(states, at)) for at in recorded
     ]
 
 

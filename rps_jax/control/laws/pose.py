@@ -21,7 +21,7 @@ behind the contact. Let g = h_2 be the way that is left, and m the middle of the
 goal's line by y.
 
   Q4  leg: k = 2 if g < s_min, or s_flush where a side is known;  else k = 1 or 3 towards y = 0 if
-      |y| > y_tol + cap g;  else k = 0
+      |y| > y_tol + cap g + reach kappa (g - s_line)^2 / 4;  else k = 0
   Q5  its end: k = 2 at g > s_min + s_back;  k = 1 and 3 at y = 0;  k = 0 at g < stop
 
 The law is done where the last leg ends, unless the contact is uneven or |y| > y_miss. Then it
@@ -29,11 +29,20 @@ chooses again, up to `tries` times. It is also done at the time t_end. With the 
 of the base of m, or of the goal's line in a last leg that touches:
 
   Q6  push: v_x = v_max, slower near the end;  v_y = K_y c within slope v_x;  omega towards the leg
-  Q7  back off by `back`: contact lost or off the front, |c| > l_edge before the last 0.2 m, or a
-      new leg
+  Q7  back off by `back`: contact lost or off the front, |c| > l_edge (l_turn where uneven) before
+      the last 0.2 m, or a new leg
   Q8  around m on a circle R beyond the box to a point `gap` behind its face, turned to d_k; push
   Q9  look: where the last leg does not know an end of its face, c is that of the point `beyond` the
       end of the contact there; a base that stays in front of the face shifts sideways
+
+A flush face is steered like a car in a last leg whose ends are known. The base turns about points
+beside the box's middle, a half depth r ahead of the face, so that this moves straight ahead. Then
+the pressure moves along the face until its moment turns the box, and needs no friction. A box of
+the half width w on its corners follows up to the curvature w / (w^2 + depth^2), hence
+
+  Q10 kappa = turn w / (w^2 + r^2);  with the middle c_G left of the goal's line, and the heading
+      theta - K_h c_G within h_max:  omega = v clip(K_e (heading - yaw), +-kappa),
+      v_y = -omega (r + the distance of the front)
 
 Without contact v_free and omega_free are the bounds. A base that cannot move sideways steers in Q6:
 omega towards the leg + K_h c, within h_max; in Q8 it drives forwards or in reverse. The law needs a
@@ -49,7 +58,7 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SpeedMax, SuccessDistance
+from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SpeedMax, SuccessDistance, bounds_of
 from rps_jax.control.laws.unicycle import contact_of, turn_around
 from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
 from rps_jax.geometry import planar
@@ -65,6 +74,8 @@ _HALF = 0.07, 0.5  # [m] half widths of objects
 _CARROT, _AHEAD = 0.5, 1.0  # [rad] of the aim on the circle: omnidirectional or not
 _PAST = 0.35  # [m] of the front beyond the face, at which an approach has failed
 _SIDESTEP = 0.1  # [m] of the next approach after one that felt nothing
+_HALF_FRONT = 0.29  # [m]
+_AROUND, _CENTRAL = 0.08, 0.2  # [m] behind the front, and from its middle
 _WIDER = 0.1  # [m] of the circle, after a touch on the way
 _TURNS = 0.8  # [rad] between base and leg, up to which the base turns while it touches
 
@@ -81,16 +92,16 @@ class PoseParams(NamedTuple):
     omega_free: Annotated[Parameter, Spec("rad/s", "bound on |omega| without contact", gt=0)] = 0.15
     r: Annotated[
         Parameter, Spec("m", "half width of an unknown object", gt=0, tune=Bound(0.1, 0.4))
-    ] = 0.22
+    ] = 0.2346
     s_min: Annotated[
-        Parameter, Spec("m", "least way of the last leg, Q4", ge=0, tune=Bound(0.1, 1))
-    ] = 0.4
+        Parameter, Spec("m", "least way of the last leg, Q4", ge=0, tune=Bound(0.1, 2))
+    ] = 1.381
     s_flush: Annotated[
-        Parameter, Spec("m", "the same, once the box was flush, Q4", ge=0, tune=Bound(0.02, 1))
-    ] = 0.3
-    s_back: Annotated[Parameter, Spec("m", "more way, Q5", ge=0, tune=Bound(0, 0.5))] = 0.1
+        Parameter, Spec("m", "the same, once the box was flush, Q4", ge=0, tune=Bound(0.02, 2))
+    ] = 1.187
+    s_back: Annotated[Parameter, Spec("m", "more way, Q5", ge=0, tune=Bound(0, 0.5))] = 0.08447
     y_tol: Annotated[Parameter, Spec("m", "error of a last leg, Q4", ge=0, tune=Bound(0, 0.1))] = (
-        0.02
+        0.01493
     )
     cap: Annotated[
         Parameter, Spec("1", "error that the last leg corrects, Q4", ge=0, tune=Bound(0, 0.5))
@@ -102,34 +113,54 @@ class PoseParams(NamedTuple):
     tries: Annotated[Parameter, Spec("1", "number of repetitions", ge=0)] = 3.0
     slope: Annotated[
         Parameter, Spec("1", "sideways over forward speed, Q6", ge=0, tune=Bound(0.02, 0.6))
-    ] = 0.12
+    ] = 0.2135
     K_y: Annotated[
         Parameter,
         Spec("1/s", "gain of the sideways speed, Q6", ge=0, tune=Bound(0.02, 2, log=True)),
     ] = 0.2
     K_h: Annotated[
-        Parameter, Spec("rad/m", "gain of the heading, Q6", ge=0, tune=Bound(0.1, 6, log=True))
-    ] = 1.5
+        Parameter,
+        Spec("rad/m", "gain of the heading, Q6 and Q10", ge=0, tune=Bound(0.1, 6, log=True)),
+    ] = 1.798
     h_max: Annotated[
-        Parameter, Spec("rad", "bound of this heading", ge=0, tune=Bound(0.01, 0.6))
-    ] = 0.12
+        Parameter, Spec("rad", "bound of this heading", ge=0, tune=Bound(0.01, 0.8))
+    ] = 0.7169
+    turn: Annotated[
+        Parameter, Spec("1", "share of the sharpest turn, Q10", ge=0, tune=Bound(0.3, 1.2))
+    ] = 0.5994
+    reach: Annotated[
+        Parameter,
+        Spec("1", "share of a turn that the last leg may use, Q4", ge=0, tune=Bound(0, 1.5)),
+    ] = 0.7677
+    s_line: Annotated[
+        Parameter, Spec("m", "straight end of the last leg, Q4", ge=0, tune=Bound(0, 0.8))
+    ] = 0.3371
+    K_e: Annotated[
+        Parameter,
+        Spec(
+            "1/m", "curvature for an error of the heading, Q10", ge=0, tune=Bound(1, 20, log=True)
+        ),
+    ] = 9.391
     omega_push: Annotated[
         Parameter,
         Spec("rad/s", "bound on |omega| in contact", gt=0, tune=Bound(0.005, 0.15, log=True)),
     ] = 0.03
     l_edge: Annotated[
         Parameter, Spec("m", "offset of a bad contact, Q7", ge=0, tune=Bound(0.05, 0.3))
-    ] = 0.17
-    back: Annotated[Parameter, Spec("m", "retreat, Q7", ge=0, tune=Bound(0.02, 0.6))] = 0.12
+    ] = 0.1418
+    l_turn: Annotated[
+        Parameter, Spec("m", "the same, of an uneven contact, Q7", ge=0, tune=Bound(0.1, 0.3))
+    ] = 0.2511
+    back: Annotated[Parameter, Spec("m", "retreat, Q7", ge=0, tune=Bound(0.02, 0.6))] = 0.09401
     R: Annotated[
         Parameter, Spec("m", "radius of the circle beyond the box, Q8", gt=0, tune=Bound(0.4, 1))
-    ] = 0.52
+    ] = 0.5324
     gap: Annotated[
         Parameter, Spec("m", "gap at the staging point, Q8", gt=0, tune=Bound(0.03, 0.6))
-    ] = 0.06
+    ] = 0.05946
     beyond: Annotated[
         Parameter, Spec("m", "of the base beyond the felt end, Q9", ge=-0.2, tune=Bound(-0.1, 0.2))
-    ] = 0.05
+    ] = 0.02732
     looks: Annotated[Parameter, Spec("1", "number of looks in a leg, Q9", ge=0)] = 3.0
     tau: Annotated[
         Parameter, Spec("s", "time constant of the filter of the pose", ge=0, tune=Bound(0, 2))
@@ -292,12 +323,15 @@ def step(
         p_world_robot=base, yaw=yaw, in_contact=touches, base_radius=None, half_length=half_length
     )
     _, contact, normal, on_front, _ = contact_of(state.p_world_contact, flat)
+    # The middle of a contact that reaches around both corners is a little behind the front.
+    on_front |= (contact[0] > half_length - _AROUND) & (jnp.abs(contact[1]) < _CENTRAL)
     p_world_contact = base + planar.rotate(yaw, contact)
     first, touched = touches & ~state.touched, state.touched | touches
     time, t_lost = state.time + touch.period, jnp.where(touches, 0.0, state.t_lost + touch.period)
     psi = theta + state.leg * (jnp.pi / 2)
-    is_facing = jnp.abs(planar.wrap(psi - yaw)) < _FACING
     pushing = state.mode == PUSH
+    steers = omni & (state.leg == 0) & (state.t_even > 0.3)
+    is_facing = jnp.abs(planar.wrap(psi - yaw)) < jnp.where(steers, 2 * params.h_max, _FACING)
     feels = pushing & touches & on_front & is_facing & state.touched
 
     # The box. It moves with the front while this touches.
@@ -307,7 +341,7 @@ def step(
         feels & (state.t_lost < 0.1), grid @ (p_world_front - state.p_world_front), 0.0
     )
     leg, fronts, bases = state.leg, grid @ (p_world_front - goal), grid @ (base - goal)
-    along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
+    along, across = _turned(fronts, leg)[:2]
     box = Box(h, state.known, state.centred)
     felt = feel(params, box.turned(leg), along, across, obs, t_even).turned(-leg % 4)
     middle = p_world_contact + params.r * planar.unit(yaw + normal)
@@ -320,13 +354,23 @@ def step(
     both = known[1] & known[3]
     last_leg = leg == 0
     s_min = jnp.where(jnp.any(known), params.s_flush, params.s_min)
+    # Q10: the sharpest turn.
+    width = jnp.clip((h[1] + h[3]) / 2, *_HALF)
+    kappa = params.turn * jnp.minimum(width, _HALF_FRONT) / (width**2 + params.r**2)
+    bend = params.reach * kappa / 4 if omni else 0.0
+
+    def room_of(way: Array) -> Array:
+        """Return the error that a last leg of this way corrects [m]."""
+        way = jnp.maximum(way, 0.0)
+        return params.y_tol + params.cap * way + bend * jnp.maximum(way - params.s_line, 0.0) ** 2
+
     may_try = state.tries < params.tries
     is_back = (leg == 2) & feels & (way > s_min + params.s_back)
     beyond_line = jnp.where(leg == 1, y, -y)  # positive beyond the line
     is_beside = (leg % 2 == 1) & feels & (beyond_line > -0.004)
     has_looked = both | (state.looks >= params.looks)
     settled = (state.t_push > 2) & has_looked & ((t_even > 1) | (state.t_push > 6))
-    room = params.y_tol + params.cap * jnp.maximum(way_left, 0.0)
+    room = room_of(way_left)
     is_off = last_leg & feels & settled & may_try
     is_off = is_off & (jnp.abs(y) > room + 0.01) & (way_left > s_min - 0.1)
     passed = last_leg & pushing & state.touched & (way_left < -0.03)
@@ -339,7 +383,7 @@ def step(
     repeats = is_off | misses | (passed & may_try)
     done = state.done | (at_end & ~misses) | (passed & ~may_try) | (time > params.t_end)
     chooses = first | is_back | is_beside | repeats
-    room = params.y_tol + params.cap * jnp.maximum(way, 0.0)
+    room = room_of(way)
     sideways = jnp.where((jnp.abs(y) > room) & ~is_beside, jnp.where(y > 0, 3, 1), 0)
     leg_next = jnp.where((way < s_min) & ~is_off & ~is_beside, 2, sideways)
     leg = jnp.where(chooses, leg_next, leg)
@@ -363,7 +407,8 @@ def step(
     offset = aim_across - across  # [m] to the left of the base
 
     # Q7: the end of a push.
-    is_bad = ~on_front | ((jnp.abs(offset) > params.l_edge) & (~last_leg | (way_left > 0.2)))
+    edge = jnp.where(t_even > 0, params.l_edge, params.l_turn)
+    is_bad = ~on_front | ((jnp.abs(offset) > edge) & (~last_leg | (way_left > 0.2)))
     t_push = jnp.where(pushing, state.t_push + jnp.where(touches, touch.period, 0.0), 0.0)
     is_lost = (t_lost > 0.6) & (state.t_push > 0)
     failed = pushing & touched & (state.t_push == 0) & ~touches & (along > _PAST - behind)
@@ -427,20 +472,38 @@ def step(
     t_push = jnp.where(mode == PUSH, t_push, 0.0)
     t_even = jnp.where(turns, 0.0, t_even)
 
-    # Q6.
-    lateral = soft.where(weight, jnp.where(last_leg, -y, 0.0), offset)
-    steer = 0.0 if omni else jnp.clip(params.K_h * lateral, -params.h_max, params.h_max)
-    bound = soft.where(weight, params.omega_push, params.omega_max)
-    omega = jnp.where(touched, jnp.clip(planar.wrap(psi + steer - yaw), -bound, bound), 0.0)
+    # Q6 and Q10.
+    follows = omni & last_leg & feels & (t_even > 0.3) & has_looked & ~leaves
+    d = params.r * jnp.sin(planar.wrap(yaw - theta))
+    lateral = soft.where(
+        weight, jnp.where(last_leg, -(y + jnp.where(follows, d, 0.0)), 0.0), offset
+    )
+    steer = jnp.clip(params.K_h * lateral, -params.h_max, params.h_max)
+    steer = jnp.where(follows, steer, 0.0) if omni else steer
     v = jnp.where(touched, params.v_max, params.v_approach)
     v_last = jnp.clip(0.5 * way_left, 0.01, params.v_max)
     v_side = jnp.clip(-0.5 * beyond_line, 0.015, params.v_max)
     slow = jnp.where(last_leg, v_last, jnp.where(leg % 2 == 1, v_side, v))
     v = soft.where(weight, jnp.where(touched, slow, v), v)
+    turn_left = planar.wrap(psi + steer - yaw)
+    arm = half_length + params.r
+    curve = jnp.clip(params.K_e * turn_left, -kappa, kappa)
+    shift = (h[1] - h[3]) / 2 - fronts[1]
+    v = jnp.where(
+        follows,
+        jnp.minimum(v, params.v_max / jnp.hypot(1 + jnp.abs(curve * shift), curve * arm)),
+        v,
+    )
+    bound = soft.where(weight, params.omega_push, params.omega_max)
+    omega = jnp.where(
+        follows, curve * v, jnp.where(touched, jnp.clip(turn_left, -bound, bound), 0.0)
+    )
     bound = soft.where(weight, params.slope * v, 0.4 * params.v_max)
     gain = soft.where(weight, params.K_y, 0.5)
     may_slide = omni & touched & (touches | (t_push == 0))
     v_y = jnp.where(may_slide, jnp.clip(gain * lateral, -bound, bound), 0.0)
+    v_y = v_y - jnp.where(follows, omega * arm, 0.0)
+    v = v + jnp.where(follows, omega * shift, 0.0)
     # Q7 and Q8.
     flee = -contact / jnp.maximum(planar.norm(contact), 1e-3)
     flee = jnp.where(omni & on_way, flee, -planar.unit(jnp.zeros_like(yaw))) * params.v_free
@@ -501,6 +564,7 @@ LAW = Law(
     step,
     senses="ends",
     check=check,
+    bounds=bounds_of(PoseParams),
     drives=("omni", "differential"),
     room=1.5,
     heading=True,
@@ -511,12 +575,19 @@ LAW = Law(
 PRESETS = {
     "pose": PoseParams(),
     "pose_drive": PoseParams(  # for bases that cannot move sideways
-        s_min=0.6,
+        r=0.22,
+        s_min=0.8,
+        s_flush=0.6,
         s_back=0.15,
+        y_tol=0.02,
+        cap=0.12,
+        K_h=2.0,
+        h_max=0.25,
         l_edge=0.25,
         back=0.3,
         R=0.7,
         gap=0.3,
-        looks=0.0,
+        beyond=0.05,
+        looks=1.0,
     ),
 }

@@ -38,7 +38,8 @@ _ARROW = 0.4  # [m] length of the goal's arrow in pictures
 class PoseProgress(NamedTuple):
     """Pushed face of a trial, and its errors."""
 
-    face: Float[Array, "*B 3"]  # [m, m, rad] middle and inward normal, in the object's frame
+    # [m, m, rad, m] middle and inward normal in the object's frame, and width
+    face: Float[Array, "*B 4"]
     way: Float[Array, "*B 3 2"]  # [m] earlier positions of a cylinder, the latest first
     errors: Float[Array, "*B 3"]  # [m, m, rad] as `outcomes`; NaN before the first touch
     declared: Floats  # [1] whether the law has declared that it is done
@@ -47,7 +48,7 @@ class PoseProgress(NamedTuple):
         """Return the errors of the pushed face, and whether the law ended the trial."""
         place, sideways, heading = jnp.moveaxis(self.errors, -1, 0)
         named = {"place_error": place, "sideways_error": sideways, "heading_error": heading}
-        return named | {"declared": self.declared}
+        return named | {"face_width": self.face[..., 3], "declared": self.declared}
 
 
 class PoseCourse(NamedTuple):
@@ -61,8 +62,8 @@ class PoseCourse(NamedTuple):
     def start(self) -> PoseProgress:
         """Return the progress before the first touch."""
         zero = jnp.zeros_like(self.heading)
-        nothing = jnp.zeros(3, zero.dtype)
-        return PoseProgress(nothing, jnp.full((3, 2), jnp.inf, zero.dtype), nothing + jnp.nan, zero)
+        way, errors = jnp.full((3, 2), jnp.inf, zero.dtype), jnp.full(3, jnp.nan, zero.dtype)
+        return PoseProgress(jnp.zeros(4, zero.dtype), way, errors, zero)
 
     def step(self, progress: PoseProgress, positions: Positions) -> tuple[PoseProgress, Aim]:
         """Judge the pushed face against the goal."""
@@ -109,8 +110,8 @@ def _extended(way: Float[Array, "3 2"], middle: Float[Array, "2"]) -> Float[Arra
 
 def _pushed_face(
     footprint: fp.Footprint, contact: Float[Array, "2"], base_yaw: Floats
-) -> Float[Array, "3"]:
-    """Return the middle and the inward normal of the face nearest to a contact point.
+) -> Float[Array, "4"]:
+    """Return middle, inward normal and width of the face nearest to a contact point.
 
     All are in the object's frame. Near a corner the face that the base looks at is preferred.
     """
@@ -122,7 +123,7 @@ def _pushed_face(
     inward = planar.direction(jnp.stack([-along[:, 1], along[:, 0]], axis=-1))
     away = planar.norm(contact - nearest) - 0.02 * jnp.cos(inward - base_yaw)
     away = jnp.where(length > 0, away, jnp.inf)
-    faces = jnp.concatenate([start + along / 2, inward[:, None]], axis=-1)
+    faces = jnp.concatenate([start + along / 2, inward[:, None], length[:, None]], axis=-1)
     return faces[jnp.argmin(away)]
 
 
@@ -136,6 +137,7 @@ class Pose(Task):
         "place_error": Spec("m", "distance of the pushed face's middle from the goal at the end"),
         "sideways_error": Spec("m", "part of it across the goal's heading"),
         "heading_error": Spec("rad", "angle between the pushed face's normal and the goal's"),
+        "face_width": Spec("m", "width of the pushed face; 0 for a cylinder"),
         "declared": Spec("1", "whether the law declared that it was done"),
     }
 
