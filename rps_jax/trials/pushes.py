@@ -219,11 +219,14 @@ def record_batch(
         simulated = float(trials.steps.sum()) * period
         callback(Progress(int(trials.done.sum()), simulated, compile_time))
     columns, states = jax.tree.map(lambda *leaves: np.stack(leaves), *moments)
-    recorded = [(~columns.done[:, i], i) for i in range(worlds.indices.size)]  # until their ends
-    fields = *ends, *worlds.inputs
-    return [
-        Trajectory(rows(columns, at), *rows(fields, at[1]), rows(states, at)) for at in recorded
-    ]
+    trajectories = list[Trajectory]()
+    for i in range(worlds.indices.size):
+        recorded = ~columns.done[:, i], i  # until its end
+        outcome, world, params = rows((ends[0], *worlds.inputs), i)
+        states_of_trial = rows(states, recorded)
+        snapshots = rows(columns, recorded)
+        trajectories.append(Trajectory(snapshots, outcome, world, params, states_of_trial))
+    return trajectories
 
 
 def watch(
