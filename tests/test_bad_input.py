@@ -97,7 +97,7 @@ SHARED = {
 COMMANDS = {
     "table": {
         "--out run": "out = run holds another run .* choose another folder",
-        "--objects bx": "unknown object 'bx': choose from box, closet, cylinder, .*did you mean 'box'",
+        "--objects bx": "unknown object 'bx': choose from box, closet, .*did you mean 'box'",
         "--objects": r"objects = \(\) is not allowed: name each once, at least one",
         "--objects box box": r"objects = .* is not allowed: name each once",
         "--laws mpc": "unknown law 'mpc': choose from aps, .* rps",
