@@ -76,8 +76,6 @@ STALE: dict[str, str] = {
             "gradients_race",
             "gradients_race_18",
             "gradients_stiff",
-            "pose",
-            "pose_failures",
             "pose_parity",
             "support",
             "support_hardware",

@@ -315,7 +315,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 60 {_MACHINE}", cores=10),
     **dict.fromkeys(
-        ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 800 {_MACHINE}", cores=20)
+        ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 10000 {_MACHINE}", gpu=2)
     ),
     "drives": recipe(f"rps sweeps/drives --worlds 4000 {_MACHINE}", cores=14, gpu=6),
     "drives_omni": recipe(
