@@ -84,6 +84,7 @@ TABS: dict[str, list[Any]] = {
         "notebooks/examples/ros2/rps_push/README.md",
     ],
     "Physics": [
+        "docs/my_object.md",
         "mjcf/README.md",
         "ground",
         "real_pushes",

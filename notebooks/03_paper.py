@@ -113,8 +113,10 @@ distance.to_series().unstack("law").round(3)
 # The page of `rps sweeps/paper_reading` has all numbers under the posterior, and as predicted from
 # all other numbers. The box's D on the hardware can be reproduced
 # (<!-- cell: reading_numbers | hardware, box: D | paper -->0.032 m<!-- end --> in the paper, <!-- cell: reading_numbers | hardware, box: D | posterior -->0.033<!-- end --> m under the posterior), but
-# the other numbers do not predict it (<!-- cell: reading_numbers | hardware, box: D | predicted from the others -->0.060<!-- end --> m): it needs a base that loses a
-# share of <!-- cell: reading_posterior | hardware | share of omega that is lost | posterior: median, 5 to 95 % -->0.42<!-- end --> (median) of its yaw rate, and nothing else in the paper tells of such a loss.
+# the other numbers do not predict it (<!-- cell: reading_numbers | hardware, box: D | predicted from the others -->0.060<!-- end --> m). With the
+# box on its corners, draws with a small D lose a share of <!-- cell: reading_posterior | hardware | share of omega that is lost | posterior: median, 5 to 95 % -->0.42<!-- end --> (median) of the yaw rate. This does not follow
+# from the paper: slips, friction and pressure under the box are fitted together, and the pressure stays unknown
+# (even <!-- cell: support_posterior | pressure under the box | even | posterior -->30%<!-- end -->, rim <!-- cell: support_posterior | pressure under the box | rim | posterior -->35%<!-- end -->, corners <!-- cell: support_posterior | pressure under the box | corners | posterior -->35%<!-- end --> of the posterior of `sweeps/ground/support.py`).
 #
 # Four numbers of the hardware meet several fitted settings: these are enough to reproduce the
 # numbers, and no proof that they are the cause. The radius of the first arc of the paper's Fig. 7

@@ -95,6 +95,8 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "pose*": ("pose",),
     "drives_omni": ("wide", "hostile", "real"),
     "drives_engines": ("drives", "push_mujoco"),
+    "drives_tasks": ("drives", "path", "corridor"),
+    "drives_learned": ("drives", "learn"),
     "engines_*": ("wide", "mujoco", "mjx", "quasistatic"),
     "export_*": ("export_c", "export_js", "wide"),
     "attack": ("attack", "tune_es"),

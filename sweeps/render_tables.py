@@ -77,12 +77,9 @@ STALE: dict[str, str] = {
             "gradients_race_18",
             "gradients_stiff",
             "pose_parity",
-            "support",
-            "support_hardware",
         ),
         "a sum in the solver got its former order back, with other last bits",
     ),
-    "drives_engines": "`unicycle` turned during its retreats",
 }
 NUMBERS = SWEEPS / "publish" / "numbers.json"
 _NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"

@@ -7,7 +7,6 @@ import signal
 from importlib import metadata
 from pathlib import Path
 
-import graph_verifier
 import pytest
 import shapes
 import tolerances
@@ -58,13 +57,13 @@ def pytest_configure(config):
     # A shell that starts pytest in the background lets it and its subprocesses ignore interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     shapes.install()
+    import graph_verifier  # and with it JAX, which reads the environment once
     import jax
 
     from rps_jax.engines import device
     from rps_jax.world import rendering
 
     graph_verifier.install()
-
     rendering.choose_gl()
     device.configure_xla()
     cache = config.rootpath / ".jax_cache"
@@ -75,13 +74,12 @@ def pytest_configure(config):
 
 # Slow files start first; a slow file at the end would leave processors idle.
 LONGEST = """
-    learning publish library task_commands replay gym export benchmark bags faults native law
-    fit evaluate law_files round_base scene push_page failures sweep contact_derivatives
-    lowering random_laws rivals smooth examples tasks cli tune trial robot gallery ladder view
-    planning limits rooms walls skin mjx_gradients gpu_writer package_laws ground footprint
-    video points programs study gradients quality force derivatives physics feet shell notebooks
-    env film quasistatic baselines descent landscape ros2 project_studies house real_pushes
-    cluster
+    library derivatives drives replay rivals native drive_commands push_page learning export
+    lowering bags finger contact_derivatives fit faults smooth pose mjx_gradients support trial
+    sweep examples view robot tasks cli transformations evaluate task_commands tune random_laws
+    house rooms ladder failures publish gym law ros2 benchmark gallery video frames gpu_writer
+    figures film fused scene package_laws env floors shell planning walls verifier footprint
+    predict_push skin ground
 """
 
 

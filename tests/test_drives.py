@@ -30,6 +30,7 @@ from rps_jax.trials.env import PushEnv
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
+from rps_jax.world import scene
 
 PERIOD = 0.02
 DIFFERENTIAL = Robot(drive="differential", axle=0.2, track=0.5)
@@ -219,6 +220,17 @@ test_a_drive_is_refused = refusals(
 )
 
 
+@pytest.mark.parametrize("name", ["turtlebot4", "jackal", "husky", "mir100", "f1tenth"])
+def test_in_pictures_a_robot_has_its_size(name):
+    robot = ROBOTS[name]
+    model = scene.load("box", robot=robot).model
+    geoms = np.flatnonzero(model.geom_bodyid == model.body("base").id)
+    middle, half = np.split(model.geom_aabb[geoms], 2, axis=1)
+    upright = np.abs(model.geom_quat[geoms][:, 0]) > 0.999  # wheels stick out a little
+    reach = (np.abs(middle + model.geom_pos[geoms]) + half)[upright, :2].max(axis=0)
+    np.testing.assert_allclose(reach, robot.sizes, atol=0.005)
+
+
 def test_a_law_that_moves_sideways_is_refused_with_those_that_do_not():
     expected = r"law = rps_plus is not allowed: it moves sideways, .*differential.* unicycle"
     with refusing(expected):
@@ -227,7 +239,7 @@ def test_a_law_that_moves_sideways_is_refused_with_those_that_do_not():
 
 test_a_task_without_room_for_detours_is_refused = refusals(
     lambda task: Case(law="unicycle", task=task),
-    (("corridor,width=2",), "task = corridor with the law unicycle is not allowed: .* 1.5 m"),
+    (("corridor,width=1.9",), "task = corridor with the law unicycle is not allowed: .* 1 m"),
 )
 
 

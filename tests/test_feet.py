@@ -115,7 +115,7 @@ def test_the_rigid_solver_supports_feet():
     ("feet", "message"),
     [
         (FEET[:2], "give 3 to 8 rows"),
-        (np.column_stack([FEET, [1, -1, 1]]), "must be positive"),
+        (np.column_stack([FEET, [1, 0, 1]]), "must be positive"),
         (FEET + 0.3, "it tips over"),
         (FEET * np.nan, "must be finite"),
     ],

@@ -10,7 +10,9 @@ from helpers import decode, refusing, rps, setting_of
 
 from rps_jax.app import film
 from rps_jax.app.cli import flags
+from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.robot.robot import Robot
 from rps_jax.runs.plan import Plan, open_run
 from rps_jax.world import video
 from rps_jax.world.domain import DOMAINS
@@ -157,6 +159,19 @@ def test_a_finished_trial_is_labelled_and_not_drawn_again(tmp_path):
     assert last[0].label.startswith("world 0\nreached at ")
     assert last[0] is previous[0]
     assert last[1] is not previous[1]
+
+
+def test_a_film_shows_mode_and_memory_of_the_law(tmp_path):
+    domain = dataclasses.replace(DOMAINS["paper"], objects=("box",), targets=((-2.0, 0.1),))
+    domain = dataclasses.replace(domain, robot=Robot(drive="differential"))
+    laws = {"unicycle": registry.LAWS["unicycle"]}
+    plan = Plan(domain, 1, laws, setting_of(60.0, ENGINE))
+    (take,) = film.of_sweep(tmp_path, plan, ["unicycle"], "first", (1, 1))
+    shots = [shot for _, (shot,) in islice(film._shots(take, plan.setting, 50), 40)]
+    assert np.isnan(shots[0].remembered).all()
+    assert np.isfinite(shots[-1].remembered).all()
+    modes = {shot.label.partition(" s")[2] for shot in shots}
+    assert modes == {"", ", backing off", ", driving around the object"}
 
 
 def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):

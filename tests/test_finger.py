@@ -1,5 +1,7 @@
 """Pushes by one round finger, and objects that are fitted to them."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,7 @@ import rps_jax
 from rps_jax.engines import finger
 from rps_jax.engines.finger import Slider
 from rps_jax.tuning import objects
-from rps_jax.tuning.objects import Pushes
+from rps_jax.tuning.objects import ObjectFit, Pushes
 
 RADIUS, FRICTION = 0.005, 0.3
 SQUARE = np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]])
@@ -109,7 +111,7 @@ def measured():
     path, pose = random_pushes(SQUARE, 40, seed=5)
     x = jnp.asarray([TRUTH.get(name, 0.0) for name in objects.PRIOR])
     inputs = [jnp.asarray(y) for y in (path, pose, pose)]
-    fixed = objects._fixed(SQUARE, RADIUS)
+    fixed = objects._fixed(SQUARE, finger.uniform_pads(SQUARE), RADIUS)
     end = np.asarray(objects._simulate(x, fixed, *inputs)[0], float)
     end = end + np.random.default_rng(0).normal(size=end.shape) * [2e-4, 2e-4, 2e-3]
     return Pushes(path, pose, end)
@@ -130,6 +132,23 @@ def test_a_fit_finds_the_object_and_predicts_other_pushes(measured):
     assert np.mean(off["place"] < predicted.place.values) > 0.7
     assert fitted.feet.shape[1] == 5
     assert len(fitted.feet) <= 16
+
+
+def test_what_the_model_leaves_corrects_pushes_nearby(measured):
+    few = Pushes(*(x[:12].copy() for x in measured))
+    few.end[0, 0] += 2e-3
+    fitted = objects.fit(SQUARE, few, RADIUS)
+    without = replace(fitted, nearby=ObjectFit.nearby)
+    change = (fitted.predict(few).pose - without.predict(few).pose).values
+    assert change[0, 0] > 3 * np.median(np.abs(change[1:, 0]))
+    far = Pushes(few.path + 1.0, few.start, few.end)
+    assert_allclose(fitted.predict(far).pose, without.predict(far).pose, atol=1e-9)
+
+
+def test_an_object_on_known_feet_is_fitted(measured):
+    fitted = objects.fit(SQUARE, Pushes(*(x[:6] for x in measured)), RADIUS, feet=0.8 * SQUARE[:3])
+    assert_allclose(fitted.feet[:, :2], 0.8 * SQUARE[:3])
+    assert_allclose(fitted.feet[:, 2].sum(), 1.0, atol=1e-6)
 
 
 def table_of(pushes):
@@ -156,5 +175,9 @@ def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_
         rps_jax.fit_object(2 * SQUARE, table, RADIUS)
     with refusing("gap at the end"):
         rps_jax.fit_object(0.9 * SQUARE, table, RADIUS)
+    with refusing("without a contact at the end"):
+        rps_jax.fit_object(SQUARE, table.assign(tip_x=1.0 + table.tip_x), RADIUS)
+    with refusing("give 3 to 64 points"):
+        rps_jax.fit_object(SQUARE, table, RADIUS, feet=SQUARE[:2])
     with refusing("lack the column"):
         rps_jax.fit_object(SQUARE, table.drop(columns="yaw"), RADIUS)

@@ -14,9 +14,9 @@ from rps_jax.geometry import solid
 from rps_jax.questions import Run
 from rps_jax.robot.shell import HALF_WIDTH
 from rps_jax.trials.progress import no_progress
-from rps_jax.world import draws
+from rps_jax.world import draws, paper
 from rps_jax.world.domain import DOMAINS
-from sweeps.ground import grounds, pushes, rigid, straight
+from sweeps.ground import grounds, pushes, rigid, straight, support
 from sweeps.ground.rigid import Pushed, Rounding
 
 MU, MU_ROBOT = 0.3, 0.35
@@ -240,3 +240,35 @@ def test_straight_pushes_on_low_friction_need_mu_m_g():
     header, *rows = straight.table(results)
     assert len(rows) == 2
     assert len(header) == len(rows[0])
+
+
+def test_the_posterior_of_the_support_is_that_by_hand():
+    """The box is as in the paper on its rim with the last slips; the cylinder tells nothing."""
+    shape = (len(support.SLIPS), 2, len(support.SUPPORTS), len(support.FRICTIONS))
+    printed = list(paper.HARDWARE_RESULTS.values())
+    dims = ("slips", "object", "support", "friction")
+    means = {
+        "D": np.broadcast_to(np.array([x.mean_abs_l for x in printed])[:, None, None], shape),
+        "time": np.broadcast_to(np.array([x.time for x in printed])[:, None, None], shape),
+        "D_variance": np.zeros(shape),
+        "time_variance": np.zeros(shape),
+        "successes": np.ones(shape),
+    }
+    d = means["D"].copy()
+    d[:, 0] += 0.02
+    d[-1, 0, 1] -= 0.02
+    d[:, 1, 2] = np.nan  # a cylinder has no corners
+    coords = {"object": ["box", "cylinder"], "support": list(support.SUPPORTS)}
+    coords["friction"] = list(support.FRICTIONS)
+    columns = {name: (dims, x) for name, x in (means | {"D": d}).items()}
+    results = xr.Dataset(columns, coords)
+    p = support.posterior(results)
+    assert_allclose(p.sum(("slips", "support", "friction")), 1)
+    shares = support.marginals(results)
+    assert shares["pressure under the box"]["rim"] > 0.99
+    assert shares["pressure under the cylinder"] == pytest.approx(
+        {"even": 0.5, "rim": 0.5, "corners": 0}, abs=1e-6
+    )
+    assert shares["slips"]["three"] > 0.99
+    slips = len(support.SLIPS) - 1
+    assert support.readings(results)["three slips"][0] == (slips, 1, 0)

@@ -8,6 +8,7 @@ import sys
 import tomllib
 from importlib import import_module
 
+import jax
 import pytest
 from helpers import ROOT, addresses, inner_names, output_of
 
@@ -25,6 +26,12 @@ def test_each_private_interface_has_a_test_that_notices_a_change():
         assert all((PACKAGE / name).exists() for name in re.findall(r"`(.*?)`", sources))
         file, name = test.strip().strip("`").split("::")
         assert f"def {name}(" in (ROOT / "tests" / file).read_text()
+
+
+def test_xla_compiles_as_the_set_up_of_the_tests_says():
+    """JAX reads the environment when something first imports it."""
+    is_fast = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") == "true"
+    assert jax.config.read("jax_disable_most_optimizations") == is_fast
 
 
 def test_a_public_method_has_or_inherits_a_docstring():

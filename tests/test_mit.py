@@ -1,5 +1,7 @@
 """The study of pushes of the MIT push dataset, on files in its format."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -60,3 +62,34 @@ def test_the_table_has_medians_and_coverage():
     assert table.rows[1][:4] == ["all", "best published", "3", "2.00 mm"]
     assert table.rows[1][-1] == "33 %"
     assert len(by_cell.rows) == 1 + len(study.METHODS)
+
+
+def test_a_clean_split_trains_on_the_pushes_that_it_does_not_test(clone, monkeypatch):
+    """Test pushes are the middle parts of pushes of the cell, in another order."""
+    rng = np.random.default_rng(0)
+    start, way = rng.uniform(0, 0.3, (8, 2)), rng.normal(size=(8, 2))
+    way *= 0.05 / np.linalg.norm(way, axis=1)[:, None]
+    path, pose = np.stack([start, start + way], axis=1), rng.normal(size=(8, 3))
+    whole = study.Cell(np.eye(3, 2), study.Pushes(path, pose, pose), pose)
+    chosen = np.array([6, 1, 3])
+    inner = np.stack([start + 0.06 * way, start + 0.94 * way], axis=1)[chosen]
+    test = study.Cell(np.eye(3, 2), study.Pushes(inner, pose[chosen], pose[chosen]), pose[chosen])
+    monkeypatch.setattr(study, "_logs", lambda *_: test)
+    assert study._clean_split(clone, "abs hex 10", whole)[1].tolist() == [0, 2, 4, 5, 7]
+
+
+def test_the_triangle_stands_flat_or_on_its_feet():
+    for name, count in (("triangle_flat", None), ("triangle_wide", 3)):
+        cell = study.read(Path(), f"CMU-plywood {name} 2")
+        assert cell.pushes.path.shape == (50, 2, 2)
+        assert (cell.feet is None) if count is None else (len(cell.feet) == count)
+        assert len(study._unbroken(cell, np.arange(50))) == 50
+
+
+def test_intervals_are_scaled_by_the_errors_of_other_objects():
+    dims, ratio = ("cell", "estimator", "draw", "push"), np.ones((3, 1, 1, 50))
+    ratio[1] = 2.0
+    columns = {"place_ratio": (dims, ratio), "turn_ratio": (dims, ratio)}
+    labels = ["abs hex 10", "abs tri1 10", "plywood hex 10"]
+    scaled = study._scaled(xr.Dataset(columns, {"cell": labels})).place_ratio
+    assert_allclose(scaled[:, 0, 0, 0], [0.5, 2.0, 1.0])

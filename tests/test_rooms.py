@@ -4,8 +4,9 @@ import dataclasses
 import json
 import time
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import refusal, refusing, rps, setting_of
@@ -15,6 +16,7 @@ from PIL import Image
 from shapely import LineString, MultiLineString, MultiPoint, Point, Polygon, box
 
 import rps_jax
+from rps_jax import Observation
 from rps_jax.record import files
 from rps_jax.world import draws, points, tasks
 from rps_jax.world.domain import from_json, parse_domain, task_in_words, to_json
@@ -247,6 +249,54 @@ def test_a_path_keeps_the_clearance_and_no_corner_can_be_left_out():
             assert LineString(path[[i - 1, i + 1]]).distance(obstacles) < 0.7
 
 
+def hall_of_pillars(**changes: Any) -> Rooms:
+    """Return a map of 28 x 20 m with 143 pillars, which have 572 walls."""
+    grid = [(2.2 * i, 1.8 * j) for i in range(13) for j in range(11)]
+    pillars = [box(x, y, x + 0.3, y + 0.3).exterior.coords[:-1] for x, y in grid]
+    outline = [[-1, -2], [28, -2], [28, 20], [-1, 20]]
+    task = {"outline": outline, "polygons": pillars, "start": [-0.2, -1, 0.9], "goal": [27.3, 19.2]}
+    return room(**task | {"base_radius": 0.4, "object_radius": 0.2} | changes)
+
+
+def test_a_path_in_a_large_map_is_clear_and_short_and_a_world_has_the_walls_near_it():
+    task = hall_of_pillars(goal=[[27.3, 19.2], [1.9, 19.2]])
+    near, reach = task._near
+    assert reach is not None
+    assert near.shape == (2, 256)
+    for path, ends, limit in zip(task._routes, near, reach, strict=True):
+        line = LineString(np.stack([path.real, path.imag], axis=1)[1:])
+        assert line.distance(MultiLineString(lines_of(task))) > 0.6 - 1e-9
+        assert line.length < 1.1 * abs(path[-1] - path[1])
+        known = {
+            frozenset(map(tuple, np.round(pair, 6)))
+            for pair in np.stack([ends.real, ends.imag], axis=1).reshape(-1, 2, 2)
+        }
+        line = LineString(np.stack([path.real, path.imag], axis=1))
+        away = {wall: LineString(list(wall)).distance(line) for wall in edges(task)}
+        assert {wall for wall in away if away[wall] < limit - 1e-6} <= known
+        assert min(away[wall] for wall in away.keys() - known) == pytest.approx(limit)
+    _, walls, drawn = world(task, 8)
+    assert walls.shape == (8, 128, 2, 2)
+    assert set(np.round(drawn.course.reach, 6)) == set(np.round(reach, 6))
+
+
+def test_small_obstacles_and_what_a_crop_leaves_out_vanish(tmp_path):
+    image = GREY.copy()
+    image[20, 10] = 0  # a cell of 0.0156 m2 in free space
+    Image.fromarray(image).save(tmp_path / "room.png")
+    given = ROS | {"image": str(tmp_path / "room.png")}
+    with_speck, without = (tasks.parse_task(given | x) for x in ({}, {"specks": 0.02}))
+    assert isinstance(with_speck, Rooms)
+    assert isinstance(without, Rooms)
+    Image.fromarray(GREY).save(tmp_path / "room.png")
+    clean = tasks.parse_task(given)
+    assert without == clean
+    assert len(with_speck.walls) == len(without.walls) + 4  # its tolerance is a cell
+    cropped = tasks.parse_task(given | {"crop": [0, 0, 8, 4]})
+    assert isinstance(cropped, Rooms)
+    assert np.max(cropped.walls, axis=0)[1] == pytest.approx(4.1)
+
+
 def test_the_world_is_the_frame_of_the_base_at_its_start():
     (path,), (walls,), drawn = world(room())
     yaw, start = 0.3, np.array([1, 1])
@@ -304,6 +354,39 @@ def test_a_trial_ends_at_a_wall_and_a_wide_door_lets_it_pass(tmp_path):
     assert not touched.outcome.success
     point = Point(touched.data.outcome_touch_x + 1.5, touched.data.outcome_touch_y + 2)
     assert Polygon(low).boundary.distance(point) < 1e-5
+
+
+class Sideways(NamedTuple):
+    """Parameters of a law that moves to the right."""
+
+    d_success: float = 0.05
+
+
+def test_a_trial_ends_where_the_walls_are_not_known(registries):
+    """The base leaves a straight path of a hall sideways: other walls are 3 m from the path."""
+    rows = [[[x, y], [x + 0.1, y], [x, y + 0.1]] for x in np.arange(0.3, 9, 0.4) for y in (3, 4)]
+    outline = [[-1, -9], [10, -9], [10, 9], [-1, 9]]
+    twist = rps_jax.Twist(jnp.float32(0.0), jnp.float32(-0.2), jnp.float32(0.0))
+
+    def step(params: Sideways, state: tuple[()], obs: Observation) -> Any:
+        return state, twist, rps_jax.Details.from_obs(obs)
+
+    law = rps_jax.Law(lambda params: (), step)
+    rps_jax.register_law("sideways", law, Sideways())
+    ends = []
+    for polygons in (rows, rows[:20]):
+        task = {"polygons": polygons, "outline": outline, "start": [0, 0, 0], "goal": [8, 0]}
+        trace = rps_jax.push(
+            "box", law="sideways", task=task, skin="ideal", setting=setting_of(30.0)
+        )
+        ends.append((trace.data.outcome_wall_touch.item(), trace.outcome.base_pose[1].item()))
+    parsed = room(polygons=rows, outline=outline, start=[0, 0, 0], goal=[8, 0])
+    (touch, y), (free, further) = ends
+    reach = parsed._near[1]
+    assert reach is not None
+    assert (touch, free) == (1, 0)
+    assert further < -5
+    assert y == pytest.approx(0.46 - reach[0], abs=0.2)
 
 
 @pytest.mark.slow
@@ -370,10 +453,10 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         ROS | {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]]},
         "the image defines the outline",
     ),
-    "many polygons": (HALL | {"polygons": [SQUARE] * 100_000}, "at most 128 are allowed"),
+    "many polygons": (HALL | {"polygons": [SQUARE] * 100_000}, "at most 4096 are allowed"),
     "many corners": (
         HALL | {"polygons": [[[4 + np.cos(x), np.sin(x)] for x in np.linspace(0, 6.28, 20_000)]]},
-        "at most 128 are allowed",
+        "at most 4096 are allowed",
     ),
     "goal at wall": (HALL | {"goal": [8.8, 2]}, "and one is 0.20 m away"),
     "goal at start": (HALL | {"goal": [1.5, 2]}, "the base starts there"),
@@ -384,8 +467,8 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "narrow base": (HALL | {"base_radius": 0.2}, "half of the base's width"),
     "many": (
-        HALL | {"outline": [[9 * np.cos(x), 9 * np.sin(x)] for x in np.linspace(0, 6.28, 150)]},
-        "at most 128 are allowed: give a larger tolerance",
+        HALL | {"outline": [[9 * np.cos(x), 9 * np.sin(x)] for x in np.linspace(0, 6.28, 5000)]},
+        "at most 4096 are allowed: give a larger tolerance",
     ),
     "typo": (HALL | {"polygon": []}, "did you mean 'polygons'?"),
     "drawn turns": (HALL | {"turns": 2}, "task quantity of rooms"),
@@ -409,8 +492,14 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "cut": (ROS | {"image": "cut.pgm"}, "give a PGM, PNG or BMP file"),
     "no picture": (ROS | {"image": "map.json"}, "give a PGM, PNG or BMP file"),
-    "large noise": (ROS | {"image": "specks.png", "start": [4, 4, 0]}, "remove its specks"),
-    "jagged": (ROS | {"image": "jagged.png", "start": [4, 4, 0]}, "give a larger tolerance"),
+    "large noise": (ROS | {"image": "specks.png", "start": [4, 4, 0]}, "specks=0.1"),
+    "dense": (
+        HALL | {"polygons": [[[x, 3.3], [x + 0.03, 3.3], [x, 3.4]] for x in np.arange(3, 6, 0.05)]},
+        "task walls = 188 is not allowed: the 128 nearest to the path reach 1.3",
+    ),
+    "specks": (ROS | {"specks": 20}, "task specks = 20 is not allowed: it must"),
+    "crop": (ROS | {"crop": [1, 2]}, "task crop"),
+    "crop without the start": (ROS | {"crop": [2, 0, 8, 6]}, "outside of the image"),
     "tolerance beyond the room": (
         ROS | {"tolerance": 50},
         "outside of the room (of an image, try a smaller tolerance)",
@@ -432,25 +521,21 @@ def folder(tmp_path_factory):
     """Folder of good and bad images."""
     path = tmp_path_factory.mktemp("maps")
     Image.fromarray(GREY).save(path / "room.png")
-    noise = default_rng(0).uniform(size=(80, 80)) < 0.9
-    Image.fromarray(np.where(noise, 255, 0).astype(np.uint8)).save(path / "noise.png")
+    noise = default_rng(0).uniform(size=(250, 250)) < 0.9
     specks = default_rng(0).uniform(size=(2000, 2000)) < 0.9
-    jagged = np.full((1000, 1000), True)
-    jagged[100:900:8, 100:] = False  # one obstacle of long teeth
-    jagged[100:900, 990:] = False
-    for name, cells_ in (("specks", specks), ("jagged", jagged)):
+    for name, cells_ in (("specks", specks), ("noise", noise)):
         Image.fromarray(np.where(cells_, 255, 0).astype(np.uint8)).save(path / f"{name}.png")
     for name, size in (("huge", "40000 25000"), ("large", "5000 5000"), ("cut", "50 50")):
         (path / f"{name}.pgm").write_bytes(f"P5\n{size}\n255\n".encode() + b"0" * 100)
     return path
 
 
-@pytest.mark.parametrize("name", ["specks", "jagged", "noise"])
+@pytest.mark.parametrize("name", ["specks", "noise"])
 def test_a_noisy_map_is_refused_at_once(name, folder):
     start = time.perf_counter()
-    with refusing("at most 128 are allowed"):
+    with refusing("at most 4096 are allowed"):
         tasks.parse_task(ROS | {"image": str(folder / f"{name}.png"), "start": [4, 4, 0]})
-    assert time.perf_counter() - start < 3
+    assert time.perf_counter() - start < 15  # 2 s on a quiet processor
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -1,18 +1,24 @@
 """The scenes agree with the paper, and MJX steps them like C MuJoCo."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import extent, slow
+from helpers import extent, refusing, slow, temporary_names
 from numpy.testing import assert_allclose, assert_array_equal
 from staging import simulate, stack, staged, step_in_c
 
 from rps_jax.engines import mjx as mjx_engine
 from rps_jax.geometry import footprint as fp
 from rps_jax.robot import shell
-from rps_jax.world import scene
+from rps_jax.trials import pushes
+from rps_jax.trials.case import Case
+from rps_jax.trials.setting import Setting
+from rps_jax.world import draws, objects, scene
+from rps_jax.world.domain import parse_domain
 from rps_jax.world.objects import FAMILIES, OBJECTS
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import FRICTION, JOINTS
@@ -136,3 +142,31 @@ def test_the_base_keeps_its_commanded_speed_against_the_heaviest_object():
     data = step_in_c(loaded.physics, touching(loaded), (*TWIST[:2], 0.0), 100)
     # 25 kg x 9.81 m/s^2 x 0.3 = 74 N against an armature of 1e6 kg.
     assert_allclose(data.qpos[:2], TWIST[:2] * 1.0, atol=5e-6)
+
+
+def test_the_closets_sizes_and_mass_are_drawn_from_the_guesses_of_its_file():
+    ranges = objects.guesses_of("closet")
+    drawn = draws.draw(parse_domain("hardware,objects=closet"), 3, np.arange(200)).solid
+    half = drawn.vertices[:, 0]
+    values = np.column_stack([2 * half, drawn.height, drawn.mass])
+    assert np.all((values >= ranges[:, 0]) & (values <= ranges[:, 1]))
+    assert np.all(np.ptp(values, axis=0) > 0.9 * np.ptp(ranges, axis=1))
+    case, setting = Case("closet"), Setting("mujoco")
+    first, second = (pushes.scene_of(case, setting, i) for i in (0, 1))
+    assert first.solid.mass != second.solid.mass
+    geom = first.model.geom("object")
+    assert_allclose(geom.size[:2], first.solid.vertices[0])
+    assert_allclose(first.model.body("object").pos[2], geom.size[2])
+    assert pushes.title_of(case, first).endswith(f"{float(first.solid.mass):.1f} kg")
+    assert pushes.scene_of(Case("closet", mass=30.0), setting).solid.mass == 30.0
+    start = pushes.build([case, case], setting).worlds.qpos
+    assert start[0, JOINTS.object_height] != start[1, JOINTS.object_height]
+
+
+def test_guesses_that_are_no_ranges_of_a_box_are_refused(tmp_path):
+    text = (objects.mjcf_folder() / "closet.xml").read_text()
+    for data in ("0.4 0.5", "0.6 0.35 0.5 1 0.8 1.8 20 60", "0.4 0.5 0.5 1 0.8 1.8 0 60"):
+        path = tmp_path / "guessed.xml"
+        path.write_text(re.sub('data="[^"]*"', f'data="{data}"', text))
+        with temporary_names(), refusing("give low and high of depth"):
+            objects.register_object("guessed", path)

@@ -129,7 +129,7 @@ def test_the_hardware_experiments_cover_friction_targets_and_shoves():
     rows = hardware.table(results)
     assert rows[1][1].startswith("0 of 96")
     assert "8 of 8" in rows[1]
-    assert results.recovered.shape == (2, 1, 2, 8)
+    assert results.recovered.shape == (3, 1, 2, 8)
     # All trials ended at 3 s, before the object was to be moved: none tells anything.
     assert not results.counted.any()
 

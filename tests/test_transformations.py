@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow
 
 import rps_jax
 from rps_jax import engines
@@ -38,12 +39,19 @@ def over_worlds(transformed):
     return jax.jit(jax.vmap(transformed, in_axes=(None, 0)))
 
 
+@pytest.fixture
+def traced(monkeypatch):
+    """Trace functions without a compiler of C."""
+    monkeypatch.setattr(native, "load", lambda name: True)
+
+
+QUICK = {("fused", "corridor"), *itertools.product(["quasistatic"], TASKS)}
+
+
+@pytest.mark.usefixtures("traced")
 @pytest.mark.parametrize(
     ("engine", "task"),
-    [
-        pytest.param(*pair, marks=pytest.mark.slow if pair[0] == "mjx" else ())
-        for pair in itertools.product(SETTINGS, TASKS)
-    ],
+    [pair if pair in QUICK else slow(*pair) for pair in itertools.product(SETTINGS, TASKS)],
 )
 def test_rollouts_of_all_tasks_and_engines_have_all_transformations(engine, task):
     """Trace them: JAX refuses loops of unknown length there."""
@@ -53,6 +61,7 @@ def test_rollouts_of_all_tasks_and_engines_have_all_transformations(engine, task
         assert {x.shape for x in jax.tree.leaves(shapes)} == {(2,)}
 
 
+@pytest.mark.usefixtures("traced")
 @pytest.mark.parametrize("engine", SETTINGS)
 @pytest.mark.parametrize("first", [jax.grad, jax.jacfwd])
 def test_second_derivatives_of_rollouts_are_refused_with_and_without_a_compiler(

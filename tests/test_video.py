@@ -98,6 +98,17 @@ def test_a_partially_redrawn_image_equals_the_whole_image(box, camera):
         assert len(changed(drawn, video.images(box, [qpos], **options)[0])) < 6
 
 
+def test_a_pin_marks_what_the_law_remembers_and_leaves_no_trace(box):
+    qpos, tile = scene.initial_qpos(box), video.Tile(box, FAR)
+    pins = [NOWHERE, (-0.9, 0.9), (0.9, -0.9), NOWHERE]
+    with rendering.open_renderers([tile], (320, 180), "oblique") as (renderer,):
+        plain, *marked, last = [renderer.draw(qpos, NOWHERE, pin) for pin in pins]
+    for image, column in zip(marked, (-1, 1), strict=True):
+        assert len(pin := changed(plain, image)) > 20
+        assert (column * (pin[:, 1] - 160) > 0).all()
+    assert not len(changed(plain, last))
+
+
 def test_a_trail_drawn_in_parts_equals_one_drawn_at_once(box):
     options = {"p_world_target": FAR, "size": (320, 180), "camera": "oblique"}
     frames = np.tile(scene.initial_qpos(box), (40, 1))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rps_jax.control.base import remembered_object
 from rps_jax.geometry import solid
 from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import NONE
@@ -31,7 +32,6 @@ _GROUND = (226, 226, 223)  # RGB
 _SKIN, _PRESSED = np.array([13, 168, 161]), np.array([255, 176, 0])  # RGB, from none to all foam
 _TWIST = (228, 88, 20)  # RGB
 _TAXEL = (0.022, 0.125, 0.2925)  # [m] depth, height, and height above the ground of its middle
-_PIN = np.array([0.02, 0.5])  # [m] radius and half height of what marks the remembered object
 _ARROW = 12.0  # [s] of the commanded velocity that an arrow shows
 _SHOULDERS = np.array([[0.0, 0.3, 0.45], [0.0, -0.3, 0.45]])  # [m] left and right, beside the arm
 
@@ -91,10 +91,10 @@ class Drawing:
         self._contact = world.add_icosphere(
             f"{_ROOT}/base/contact", rendering.CONTACT_RADIUS, color=_rgb(rendering.CONTACT_RGBA)
         )
-        pin = _solid_of(mujoco.mjtGeom.mjGEOM_CYLINDER, _PIN)
+        pin = _solid_of(mujoco.mjtGeom.mjGEOM_CYLINDER, np.array(rendering.PIN))
         meshes = np.asarray(pin.vertices), np.asarray(pin.faces)
         self._remembered = world.add_mesh_simple(
-            f"{_ROOT}/remembered", *meshes, color=_TWIST, visible=False
+            f"{_ROOT}/remembered", *meshes, color=_rgb(rendering.PIN_RGBA), visible=False
         )
         nowhere = np.zeros((1, 2, 3))
         shape: dict[str, Any] = {"shaft_radius": 0.016, "head_radius": 0.045, "head_length": 0.1}
@@ -143,9 +143,10 @@ class Drawing:
         if touching:
             felt = map(float, moment.snapshot.reading.p_robot_contact)
             self._contact.position = (*felt, rendering.CONTACT_HEIGHT + 0.03)
-        middle = getattr(moment.trial.law_state, "p_world_object", np.zeros(2))
-        self._remembered.visible = bool(np.any(middle))  # the law has touched it
-        self._remembered.position = (*map(float, middle), _PIN[1])
+        middle = remembered_object(moment.trial.law_state)
+        self._remembered.visible = not np.isnan(middle).any()
+        if self._remembered.visible:
+            self._remembered.position = (*map(float, middle), rendering.PIN[1])
         self._show_twist(*map(float, moment.snapshot.twist))
         way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
         self._base_path.points = _joined([m.snapshot.qpos[:2] for m in way], 0.006)

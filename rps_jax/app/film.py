@@ -18,6 +18,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
+from rps_jax.control.base import mode_of, remembered_object
 from rps_jax.errors import InputError
 from rps_jax.record import files, folder
 from rps_jax.record.options import option
@@ -258,9 +259,11 @@ def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, 
     moments = pushes.watch(take.part, setting, interval=interval * period, slots=take.slots)
     for trials, moment, outcomes in moments:
         contacts = np.asarray(trial.p_world_contact(moment))
-        states = map(_status, trials.done, trials.success, trials.steps * period)
-        texts = [f"{label}\n{state}" for label, state in zip(take.labels, states, strict=True)]
-        fresh = map(Shot, moment.qpos, contacts, texts)
+        states = [rows(trials.law_state, i) for i in range(len(ended))]
+        times = trials.steps * period
+        status = map(_status, trials.done, trials.success, times, map(mode_of, states))
+        texts = [f"{label}\n{state}" for label, state in zip(take.labels, status, strict=True)]
+        fresh = map(Shot, moment.qpos, contacts, texts, map(remembered_object, states))
         # An unchanged shot is not drawn again.
         shots = [shots[i] if ended[i] else shot for i, shot in enumerate(fresh)]
         ended = trials.done
@@ -270,8 +273,8 @@ def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, 
     yield from itertools.repeat((True, shots))
 
 
-def _status(done: bool, success: bool, time: float) -> str:
-    """Return the state of a trial after this time [s]."""
+def _status(done: bool, success: bool, time: float, mode: str) -> str:
+    """Return the state of a trial after this time [s], with the mode of its law."""
     if not done:
-        return f"{time:.0f} s"
+        return f"{time:.0f} s, {mode}" if mode else f"{time:.0f} s"
     return f"reached at {time:.0f} s" if success else "not reached"

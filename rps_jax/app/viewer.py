@@ -25,6 +25,7 @@ from rps_jax import errors
 from rps_jax.app.drawing import TARGET, Drawing, furnish
 from rps_jax.app.gate import HOST, Gate, accepts_update, check_guarded
 from rps_jax.control import registry
+from rps_jax.control.base import mode_of
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.record import files
@@ -48,13 +49,6 @@ _PANEL_TICK = 0.25  # [s] between two updates of the panel, which browsers are s
 _MAX_ELAPSED = 0.5  # [s] between two ticks, also if a push was built in the first
 _BUDGET = 0.15  # [s] of simulation between two updates of the page
 _DRAGGING = [f"TransformControls{event}Message" for event in ("Update", "DragStart", "DragEnd")]
-# Modes of laws, by the fields of their states.
-_MODES = {
-    "retreat": "backing off",
-    "around": "driving around the object",
-    "align": "turning towards the target",
-    "away": "repositioning",
-}
 Event: TypeAlias = Any  # of viser, which is optional
 _CONTACTS = ("no contact", "point contact", "line contact")
 
@@ -141,8 +135,8 @@ class View(Command[None], Case):
         """The push that the page asks for."""
         case = dataclasses.replace(self.case, **request._asdict())
         live = Live(pushes.build([case], self.setting), self.setting)
-        scene = pushes.scene_of(case, self.setting.physics)
-        return Push(live, scene, f"{case.title}, {request.law}")
+        scene = pushes.scene_of(case, self.setting)
+        return Push(live, scene, f"{pushes.title_of(case, scene)}, {request.law}")
 
 
 view = call_of(View)
@@ -310,9 +304,8 @@ class Page:
             way = f"{float(task['progress']):.0%} of the path, {error:.2f} m off it in the mean"
         contact = _CONTACTS[int(moment.reading.contact_type)]
         words = [f"{index * live.period:.1f} s", way, contact]
-        state = live.past[index].trial.law_state
-        modes = [text for name, text in _MODES.items() if np.any(getattr(state, name, 0.0) > 0.5)]
-        words += modes or ["realigning"] * bool(moment.details.realigning)
+        mode = mode_of(trial.law_state) or "realigning" * bool(moment.details.realigning)
+        words += [mode] * bool(mode)
         if self._is_over(live):
             words.append("**reached**" if live.outcome.success else "**not reached**")
             words += tasks.failures_of(task)

@@ -29,6 +29,14 @@ from rps_jax.spec import Spec, spec_at, specs_of
 # and size (`PoseObservation`).
 Senses = Literal["touch", "taxels", "ends", "force", "pose"]
 
+# Modes of laws that reposition, by the fields of their states.
+_MODES = {
+    "retreat": "backing off",
+    "around": "driving around the object",
+    "align": "turning towards the target",
+    "away": "repositioning",
+}
+
 
 @runtime_checkable
 class LawParams(Protocol):
@@ -164,3 +172,15 @@ class Law(Generic[Params, State, Obs]):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", tuple(dict(self.bounds).items()))  # a law is hashable
+
+
+def mode_of(state: Pytree) -> str:
+    """Return the mode in the state of one trial, in words; empty in a push or without modes."""
+    modes = (text for name, text in _MODES.items() if getattr(state, name, 0.0) > 0.5)
+    return next(modes, "")
+
+
+def remembered_object(state: Pytree) -> np.ndarray:
+    """Return the middle (2,) [m] of the object in the state of one trial; NaN without one."""
+    middle = np.asarray(getattr(state, "p_world_object", np.zeros(2)))
+    return middle if middle.any() else np.full(2, np.nan)

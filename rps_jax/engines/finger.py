@@ -28,6 +28,7 @@ from rps_jax.geometry.vectors import Vec, trace_one_world
 STEPS = 50  # of a push; with 100, ends move by 0.03 mm of 50 mm in the median
 _SMOOTH = 1e-3  # [1] share of the speed of the contact below which friction is smooth
 _ITERATIONS = 30  # of the two solvers, at most
+_TOGETHER = 16  # pushes of one loop: all of them go on until the last has converged
 _LENGTHS = (1.0, 0.3, 0.08)  # of steps of Newton's method
 _DEEP = 3e-4  # [m] penetration that one step undoes at most
 _ALONG = 0.02  # [1] least speed along the normal of a sliding contact, of the whole
@@ -89,7 +90,7 @@ def uniform_pads(outline: np.ndarray, count: int = _NODES) -> np.ndarray:
     width = (high - low) / cells
     at = [low[k] + width[k] / fine * (np.arange(cells[k] * fine) + 0.5) for k in (0, 1)]
     points = np.stack(np.meshgrid(*at, indexing="ij"), axis=-1)
-    inside = np.asarray(_signed(jnp.asarray(outline), jnp.asarray(points.reshape(-1, 2))) < 0)
+    inside = distances(outline, points.reshape(-1, 2)) < 0
     weight = inside.reshape(cells[0], fine, cells[1], fine)
     at_cell = points.reshape(cells[0], fine, cells[1], fine, 2)
     load = weight.sum(axis=(1, 3)).astype(float)
@@ -108,13 +109,16 @@ def push(
     The leaves of `slider` may have a leading axis B. The finger goes straight between points of a
     path, at any speed.
     """
-    axes: list[Any] = [
-        0 if jnp.ndim(x) > rank else None for x, rank in zip(slider, (2, 2, 0, 0), strict=True)
-    ]
-    batched = Slider(*axes)
-    push_one = partial(_push, steps=steps)
+    own: Any = tuple(
+        x if jnp.ndim(x) > rank else None for x, rank in zip(slider, (2, 2, 0, 0), strict=True)
+    )
+
+    def push_one(inputs: tuple) -> Pushed:
+        leaves = [a if b is None else b for a, b in zip(slider, inputs[0], strict=True)]
+        return _push(Slider(*leaves), *inputs[1:], steps=steps)
+
     with trace_one_world():
-        return jax.vmap(push_one, in_axes=(batched, 0, 0))(slider, path, pose)
+        return jax.lax.map(push_one, (own, path, pose), batch_size=_TOGETHER)
 
 
 def _push(slider: Slider, path: jax.Array, pose: jax.Array, steps: int) -> Pushed:
@@ -133,9 +137,10 @@ def _push(slider: Slider, path: jax.Array, pose: jax.Array, steps: int) -> Pushe
     return Pushed(jnp.concatenate([poses, last[None]]), jnp.append(gaps, gap))
 
 
-def _signed(outline: jax.Array, points: jax.Array) -> jax.Array:
+def distances(outline: ArrayLike, points: ArrayLike) -> np.ndarray:
     """Return signed distances (P,) [m] of points (P, 2) from a polygon, negative inside."""
-    return jax.vmap(lambda point: _nearest(outline, point)[0])(points)
+    corners = jnp.asarray(outline)
+    return np.asarray(jax.vmap(lambda point: _nearest(corners, point)[0])(jnp.asarray(points)))
 
 
 def _nearest(outline: jax.Array, point: jax.Array) -> tuple[jax.Array, jax.Array]:

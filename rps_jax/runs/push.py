@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from rps_jax import errors
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
-from rps_jax.control.base import Law, LawParams, Senses
+from rps_jax.control.base import Law, LawParams, Senses, mode_of, remembered_object
 from rps_jax.control.observation import Twist
 from rps_jax.engines import device
 from rps_jax.errors import InputError
@@ -165,8 +165,10 @@ class Trace(Trajectory):
         errors.check_finite("film_length", seconds, above=0, at_most=600, unit="s")
         shown = _evenly_spaced(len(self.snapshots.time), round(seconds * fps))
         contacts = np.asarray(p_world_contact(self.snapshots))[shown]
-        pairs = zip(watch(self.snapshots.qpos[shown]), contacts, strict=True)
-        shots = ([video.Shot(qpos, contact, "")] for qpos, contact in pairs)
+        states = [rows(self.law_states, i) for i in shown]
+        poses = watch(self.snapshots.qpos[shown])
+        marks = map(mode_of, states), map(remembered_object, states)
+        shots = ([video.Shot(*shot)] for shot in zip(poses, contacts, *marks, strict=True))
         video.render([self._tile], shots, Path(path), fps=fps, size=size)
         return Path(path)
 
@@ -199,7 +201,8 @@ class TraceQuestion(Question[Trace]):
         attrs = {"law": json.dumps(registry.params_to_json(fine.params)), "period": str(period)}
         bags.write(Path(self.bag), bag_steps(fine, observations, period), attrs)
         coarse = slice(None, None, max(1, round(0.1 / period)))
-        return dataclasses.replace(fine, snapshots=rows(fine.snapshots, coarse))
+        snapshots, states = rows((fine.snapshots, fine.law_states), coarse)
+        return dataclasses.replace(fine, snapshots=snapshots, law_states=states)
 
     @property
     def horizon(self) -> float:
@@ -302,8 +305,9 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     def answer(self, run: Run) -> Trace:
         case, setting = self.case, self.setting
         trajectory = self.record(pushes.build([case], setting), setting, run)
-        scene = pushes.scene_of(case, setting.physics)
-        named = {"scene": scene, "title": case.title, "engine": setting.engine}
+        scene = pushes.scene_of(case, setting)
+        title = pushes.title_of(case, scene)
+        named = {"scene": scene, "title": title, "engine": setting.engine}
         return Trace(**vars(trajectory), **named, attrs=self.attributes())
 
 

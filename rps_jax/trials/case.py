@@ -56,7 +56,8 @@ class Case(TrialOptions):
     object: ObjectLike = "box"
     """Object to push: its name, or a custom MJCF file, FILE.xml, of an upright box or cylinder. For
     another convex outline the file has its corners, counter-clockwise from above [m], as
-    <custom><numeric name="footprint" data="X Y X Y X Y"/></custom>."""
+    <custom><numeric name="footprint" data="X Y X Y X Y"/></custom>. The seed draws sizes and mass
+    of the closet from ranges that are guesses."""
     friction: FrictionLike = "S1"
     """Friction: a set of the paper's Table I (S1, S2), or coefficients GROUND,ROBOT."""
     target: tuple[float, float] = _TARGET

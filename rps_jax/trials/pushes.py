@@ -26,9 +26,8 @@ from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progr
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
 from rps_jax.trials.worlds import BatchOptions, Job, WorldBatch, rows
-from rps_jax.world import draws, scene
+from rps_jax.world import draws, objects, scene
 from rps_jax.world.objects import FAMILIES
-from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene, WorldInputs
 from rps_jax.world.tasks.base import CourseInputs
 
@@ -41,6 +40,7 @@ class Trajectory:
     outcome: Outcome  # without a leading axis
     world: World  # without a leading axis
     params: LawParams
+    law_states: Pytree  # (T, ...) what the law remembers at the snapshots
 
     @property
     def p_world_target(self) -> tuple[float, float]:
@@ -49,10 +49,22 @@ class Trajectory:
         return float(x), float(y)
 
 
-def scene_of(case: Case, physics: Physics) -> Scene:
-    """Compile the scene of a case."""
+def scene_of(case: Case, setting: Setting, index: int = 0) -> Scene:
+    """Compile the scene of a case; (setting.world_seed, index) draws what its object guesses."""
     options = {"rear": case.rear, "mass": case.mass, "robot": case.base}
-    return scene.load(case.object_name, physics, case.contact, **options)
+    numbers = draws.numbers(setting.world_seed, np.array([index]))
+    drawn = objects.draw_guesses(case.object_name, numbers)
+    options["drawn"] = None if drawn is None else rows(drawn, 0)
+    return scene.load(case.object_name, setting.physics, case.contact, **options)
+
+
+def title_of(case: Case, at: Scene) -> str:
+    """Return the title of a case, with the guessed size and mass of its object."""
+    if objects.guesses_of(case.object_name) is None:
+        return case.title
+    sizes = [*2 * at.solid.vertices[0], float(at.solid.height)]
+    size, mass = " x ".join(f"{x:.2f}" for x in sizes), float(at.solid.mass)
+    return f"{case.title}, guessed {size} m and {mass:.1f} kg"
 
 
 def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -80,9 +92,13 @@ def build(
     trials = np.arange(len(cases)) if indices is None else np.asarray(indices)
     for case in cases:
         setting.check_here(case.base, [case.params])
-    keys = [(case.object_name, case.mass, case.rear, case.base) for case in cases]
+    guessed = {x for x in {x.object_name for x in cases} if objects.guesses_of(x) is not None}
+    keys = [
+        (case.object_name, case.mass, case.rear, case.base, i * (case.object_name in guessed))
+        for case, i in zip(cases, trials.tolist(), strict=True)
+    ]
     different = dict(zip(keys, cases, strict=True))
-    scenes = {key: scene_of(case, setting.physics) for key, case in different.items()}
+    scenes = {key: scene_of(case, setting, key[-1]) for key, case in different.items()}
     traced = setting.simulator.traced
     solids = {key: x.rounded_solid if traced else x.solid for key, x in scenes.items()}
     starts = [_start_of(case, scenes[key]) for case, key in zip(cases, keys, strict=True)]
@@ -195,19 +211,22 @@ def record_batch(
 ) -> list[Trajectory]:
     """Run trials of one stage as `watch` does, with a snapshot every `interval` [s]."""
     period, start_time, compile_time = setting.physics.control_period, time.perf_counter(), None
-    moments = list[tuple[Trial, Snapshot, Outcome]]()
-    for moment in watch(worlds, setting, law, interval=interval, slots=slots):
+    moments, ends = list[tuple[Snapshot, Pytree]](), list[Outcome]()
+    for trials, snapshot, outcome in watch(worlds, setting, law, interval=interval, slots=slots):
+        ends = [outcome]
         compile_time = compile_time or time.perf_counter() - start_time  # of the first snapshot
-        moments.append(moment)
-        simulated = float(moment[0].steps.sum()) * period
-        callback(Progress(int(moment[0].done.sum()), simulated, compile_time))
-    _, snapshots, outcomes = zip(*moments, strict=True)
-    columns = jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots)
-    fields = outcomes[-1], *worlds.inputs
-    return [  # with snapshots until the end of each trial
-        Trajectory(rows(columns, (~columns.done[:, i], i)), *rows(fields, i))
-        for i in range(worlds.indices.size)
-    ]
+        moments.append((snapshot, jax.device_get(trials.law_state)))
+        simulated = float(trials.steps.sum()) * period
+        callback(Progress(int(trials.done.sum()), simulated, compile_time))
+    columns, states = jax.tree.map(lambda *leaves: np.stack(leaves), *moments)
+    trajectories = list[Trajectory]()
+    for i in range(worlds.indices.size):
+        recorded = ~columns.done[:, i], i  # until its end
+        outcome, world, params = rows((ends[0], *worlds.inputs), i)
+        states_of_trial = rows(states, recorded)
+        snapshots = rows(columns, recorded)
+        trajectories.append(Trajectory(snapshots, outcome, world, params, states_of_trial))
+    return trajectories
 
 
 def watch(

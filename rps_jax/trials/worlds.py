@@ -28,8 +28,8 @@ from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, Shift, World
+from rps_jax.world import objects, scene
 from rps_jax.world import points as points_
-from rps_jax.world import scene
 from rps_jax.world.domain import RANDOM, Domain, Owner, Range, quantities_of
 from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
@@ -201,7 +201,9 @@ def drawn_scene(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
     if name in RANDOM:
         return scene.compile_row(drawn.inputs(domain, physics), i)
     ground, robot = (float(leaf[i]) for leaf in drawn.friction)
-    return scene.load(name, physics, Friction(ground, robot), robot=domain.robot)
+    single = rows(drawn.solid, i) if objects.guesses_of(name) is not None else None
+    friction = Friction(ground, robot)
+    return scene.load(name, physics, friction, robot=domain.robot, drawn=single)
 
 
 # --- candidates --------------------------------------------------------------------------------

@@ -5,13 +5,14 @@
 Contact alone shows how the camera is placed against the robot and the markers on the object: at the
 end of a push the finger touches the outline. The pressure under the object is the exponential of a
 few smooth functions, and the push that ends at the measured pose has a friction. All are fitted
-together, with priors, to robust residuals (Cauchy).
+together, with priors, to robust residuals (Cauchy). A Gaussian process over the place and the
+direction of a push corrects what the fitted pushes leave nearby.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,6 +43,15 @@ PRIOR: Mapping[str, tuple[float, float]] = {
     "tilt_y": (0.0, 0.4),
     "saddle": (0.0, 0.4),
     "shear": (0.0, 0.4),
+    "cubic_x": (0.0, 0.3),
+    "cubic_y": (0.0, 0.3),
+    "trefoil_x": (0.0, 0.3),
+    "trefoil_y": (0.0, 0.3),
+    "quartic": (0.0, 0.3),
+    "quartic_saddle": (0.0, 0.2),
+    "quartic_shear": (0.0, 0.2),
+    "quatrefoil_x": (0.0, 0.2),
+    "quatrefoil_y": (0.0, 0.2),
     "camera_x": (0.0, 1e-3),
     "camera_y": (0.0, 1e-3),
     "marker_x": (0.0, 5e-4),
@@ -54,13 +64,22 @@ _OFFSETS = {"camera_x": "m", "camera_y": "m", "marker_x": "m", "marker_y": "m", 
 _GAP = 2e-4  # [m] standard deviation of gaps
 _APART = 1e-3  # [m] gap at the end of a push whose finger no longer touches
 _MOST_GAP = 5e-4  # [m] median gap at the end that a fit leaves, at most
+_FOOT = 1e-3  # [m] radius of a known foot
 _INSIDE = 5e-3  # [m] of the finger in the object at the start, at most
 # Scatter of a prediction, from other objects: a constant and a share of the motion. Quantiles of
 # errors over the scatter at 90 %, and the number of pushes that they count for in a fit.
 _SCATTER = {"place": (3e-4, 0.045), "turn": (5e-3, 0.075)}
 _QUANTILE, _PSEUDO = {"place": 2.75, "turn": 2.7}, 20
-_FEW, _BATCH = 32, 512  # pushes of a batch
-_PADS = 64
+# Lengths of the Gaussian process, from other objects: of the place of the finger over the half size
+# of the object, of the direction of the push, and of that of the object. Variance of the noise over
+# that of the process, and residuals beyond which they are cut, over 1.5 times their median.
+_NEAR, _NOISE, _CUT = (0.3, 0.4, 1.0), 0.7, 3.0
+_SMALL_BATCH, _BATCH, _MAX_PUSHES = (
+    32,
+    128,
+    512,
+)  # pushes of a small and a large batch, and of a fit at most
+_PADS, _CORNERS = 64, (8, 128)  # of an object, padded
 _COLUMNS = {"push": "", "time": "s", "x": "m", "y": "m", "yaw": "rad", "tip_x": "m", "tip_y": "m"}
 
 
@@ -115,9 +134,14 @@ def _pressure(theta: Mapping[str, jax.Array], pads: np.ndarray) -> jax.Array:
     at, load = pads[:, :2], pads[:, 2]
     at = at - load @ at
     x, y = (at / jnp.sqrt(load @ jnp.sum(at**2, axis=1))).T
-    functions = {"ring": x * x + y * y - 1, "tilt_x": x, "tilt_y": y}
-    functions |= {"saddle": x * x - y * y, "shear": 2 * x * y}
-    logarithm: Any = sum(theta[name] * value for name, value in functions.items())
+    square, saddle, shear = x * x + y * y, x * x - y * y, 2 * x * y
+    functions = {"ring": square - 1, "tilt_x": x, "tilt_y": y, "saddle": saddle, "shear": shear}
+    functions |= {"cubic_x": x * (square - 2), "cubic_y": y * (square - 2)}
+    functions |= {"trefoil_x": x * saddle - y * shear, "trefoil_y": x * shear + y * saddle}
+    functions |= {"quartic": square * square - 3 * square + 1}
+    functions |= {"quartic_saddle": saddle * (square - 2), "quartic_shear": shear * (square - 2)}
+    functions |= {"quatrefoil_x": saddle**2 - shear**2, "quatrefoil_y": 2 * saddle * shear}
+    logarithm: Any = sum(theta[name] * f for name, f in functions.items() if name in theta)
     share = load * jnp.exp(jnp.clip(logarithm, -8.0, 8.0))
     return share / share.sum()
 
@@ -165,6 +189,9 @@ class ObjectFit:
     outline: np.ndarray  # (N, 2) [m] counter-clockwise
     radius: float  # [m] of the finger
     quantile: Mapping[str, float]  # of the errors over their scatter, at 90 %
+    pads: np.ndarray  # (S, 4) of even pressure: x, y [m], share [1] and radius [m]
+    # Fitted pushes (n, 6) as of `_traits`, and their weights (n, 3) [m, m, rad] for other pushes
+    nearby: tuple[np.ndarray, np.ndarray] = (np.zeros((0, 6)), np.zeros((0, 3)))
 
     @property
     def friction(self) -> float:
@@ -174,9 +201,9 @@ class ObjectFit:
     @property
     def feet(self) -> np.ndarray:
         """Pads (S, 5) of the pressure for `register_object`, at most 16."""
-        pads = next(
-            p for n in range(14, 0, -1) if len(p := finger.uniform_pads(self.outline, n)) <= 16
-        )
+        counts = range(14, 0, -1) if len(self.pads) > 16 else ()
+        smaller = (finger.uniform_pads(self.outline, n) for n in counts)
+        pads = next((x for x in smaller if len(x) <= 16), self.pads)
         theta = {name: jnp.asarray(float(self.data["mean"].sel(parameter=name))) for name in PRIOR}
         share = np.asarray(_pressure(theta, pads), float)
         return np.column_stack([pads[:, :2], share, np.ones(len(pads)), pads[:, 3]])
@@ -191,19 +218,18 @@ class ObjectFit:
         pushes = read_pushes(pushes)
         pose, slope = self._pose_and_slope(pushes)
         scatter = _scatter(pose, slope, pushes.start, self.data.covariance.values)
+        fitted, weight = self.nearby
+        change = _kernel(_traits(self.outline, pushes), fitted) @ weight
+        pose = pose + solid.rotate(pushes.start[:, 2], change)
         radii = {name: ("push", self.quantile[name] * x) for name, x in scatter.items()}
         coords = {"axis": ["x", "y", "yaw"]}
         return xr.Dataset({"pose": (("push", "axis"), pose), **radii}, coords)
 
     def _pose_and_slope(self, pushes: Pushes) -> tuple[np.ndarray, np.ndarray]:
         """Return final poses (n, 3) and their derivatives (n, 3, p)."""
-        x, fixed = jnp.asarray(self.data["mean"].values), _fixed(self.outline, self.radius)
-        poses, slopes = [], []
-        for first in range(0, len(pushes.path), _BATCH):
-            part, count = _padded(pushes, first)
-            poses.append(np.asarray(_simulate(x, fixed, *part)[0], float)[:count])
-            slopes.append(np.asarray(_derivatives(x, fixed, *part)[0], float)[:count])
-        return np.concatenate(poses), np.concatenate(slopes)
+        fixed = _fixed(self.outline, self.pads, self.radius)
+        inputs = self.data["mean"].values, fixed, pushes
+        return _batched(_simulate, *inputs)[0], _batched(_derivatives, *inputs)[0]
 
     @property
     def misplaced(self) -> str:
@@ -220,19 +246,41 @@ class ObjectFit:
         )
 
 
-def _fixed(outline: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return outline, pads and radius; unused pads make programs of many outlines one."""
-    pads = finger.uniform_pads(outline)
+def _pads_of(feet: ArrayLike) -> np.ndarray:
+    """Return pads (S, 4) of equal loads at feet (S, 2) [m]."""
+    at = errors.check_array("feet", feet, ("S", 2))
+    if not 3 <= len(at) <= _PADS:
+        raise errors.not_allowed("feet", f"{len(at)} points", f"give 3 to {_PADS} points x, y [m]")
+    return np.column_stack([at, np.full(len(at), 1 / len(at)), np.full(len(at), _FOOT)])
+
+
+def _fixed(
+    outline: np.ndarray, pads: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return outline, pads and radius, repeated so that many objects share a program."""
     unused = np.repeat(pads[-1:] * [1, 1, 0, 1], max(0, _PADS - len(pads)), axis=0)
-    return outline, np.concatenate([pads, unused]), radius
+    corners = next((n for n in _CORNERS if n >= len(outline)), len(outline))
+    again = np.repeat(outline[-1:], corners - len(outline), axis=0)
+    return np.concatenate([outline, again]), np.concatenate([pads, unused]), radius
 
 
-def _padded(pushes: Pushes, first: int) -> tuple[list[jax.Array], int]:
-    """Return a batch of pushes, the last repeated so that sizes are few, and its true size."""
-    part = [np.asarray(x, float)[first : first + _BATCH] for x in pushes]
-    count = len(part[0])
-    missing = (_FEW if count <= _FEW else _BATCH) - count
-    return [jnp.asarray(np.concatenate([x, np.repeat(x[-1:], missing, 0)])) for x in part], count
+def _batched(
+    function: Callable[..., Pair], x: np.ndarray, fixed: tuple, pushes: Pushes
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return both outputs of a function of parameters and n pushes, with a leading axis n.
+
+    Batches are padded by repetition to one of two sizes.
+    """
+    parts = []
+    for first in range(0, len(pushes.path), _BATCH):
+        part = [np.asarray(y, float)[first : first + _BATCH] for y in pushes]
+        count = len(part[0])
+        missing = (_SMALL_BATCH if count <= _SMALL_BATCH else _BATCH) - count
+        part = [jnp.asarray(np.concatenate([y, np.repeat(y[-1:], missing, 0)])) for y in part]
+        outputs = function(jnp.asarray(x), fixed, *part)
+        parts.append([np.asarray(y, float)[:count] for y in outputs])
+    first, second = map(np.concatenate, zip(*parts, strict=True))
+    return first, second
 
 
 def _scatter(
@@ -261,6 +309,7 @@ def fit(
     pushes: PushesLike,
     radius: float,
     prior: Mapping[str, tuple[float, float]] = PRIOR,
+    feet: ArrayLike | None = None,
 ) -> ObjectFit:
     """Fit an object to measured pushes: see `FitObject`."""
     corners = finger.check_outline(outline)
@@ -272,15 +321,11 @@ def fit(
     if count < 3:
         raise errors.not_allowed("pushes", count, "give 3 or more, better 5")
     mean, deviation = np.array([{**PRIOR, **prior}[name] for name in PRIOR]).T
-    fixed, (batch, _) = _fixed(corners, radius), _padded(data, 0)
-    if count > _BATCH:
-        raise errors.not_allowed("pushes", count, f"give at most {_BATCH}")
-    size = float(np.ptp(corners, axis=0).max()) / 2
-
-    def gaps_at(x: np.ndarray) -> np.ndarray:
-        return np.asarray(_simulate(jnp.asarray(x), fixed, *batch)[1], float)[:count]
-
-    first = gaps_at(mean)
+    if count > _MAX_PUSHES:
+        raise errors.not_allowed("pushes", count, f"give at most {_MAX_PUSHES}")
+    pads = finger.uniform_pads(corners) if feet is None else _pads_of(feet)
+    fixed, size = _fixed(corners, pads, radius), float(np.ptp(corners, axis=0).max()) / 2
+    first = _batched(_simulate, mean, fixed, data)[1]
     if (first[:, 0] < -_INSIDE).any():
         i = int(np.argmin(first[:, 0]))
         rule = f"it starts {-1e3 * first[i, 0]:.1f} mm inside the object; check outline and units"
@@ -288,15 +333,15 @@ def fit(
 
     def residuals(z: np.ndarray) -> np.ndarray:
         """Return robust residuals of poses and gaps, and those of the priors."""
-        pose, gaps = _simulate(jnp.asarray(mean + deviation * z), fixed, *batch)
-        off, gap = np.asarray(pose, float)[:count] - data.end, np.asarray(gaps, float)[:count]
+        pose, gap = _batched(_simulate, mean + deviation * z, fixed, data)
+        off = pose - data.end
         off[:, 2] = size * solid.wrap(off[:, 2])
         rows = np.append(off / _UNIT, gap[:, :2].T / _GAP)
         return np.append(np.nan_to_num(np.sign(rows) * np.sqrt(np.log1p(rows**2))), z)
 
     def slopes(z: np.ndarray) -> np.ndarray:
         x, robust = mean + deviation * z, residuals(z)[: -len(z)]
-        pose, gap = (np.asarray(a, float)[:count] for a in _derivatives(x, fixed, *batch))
+        pose, gap = _batched(_derivatives, x, fixed, data)
         pose = pose / _UNIT * np.array([1, 1, size])[:, None]
         rows = np.concatenate([pose.reshape(-1, len(z)), *gap[:, :2].swapaxes(0, 1) / _GAP])
         # Derivative of Cauchy's root loss g = sqrt(log(1 + r^2)), with r^2 = exp(g^2) - 1.
@@ -308,7 +353,7 @@ def fit(
     start = np.zeros(len(mean))
     best = least_squares(residuals, start, derivatives, max_nfev=40, ftol=1e-4, xtol=1e-3)
     x = mean + deviation * best.x
-    gaps = gaps_at(x)
+    gaps = _batched(_simulate, x, fixed, data)[1]
     touches, gaps = gaps[:, 2] < _APART, gaps[:, 1]
     if not touches.any():
         raise errors.not_allowed("pushes", "without a contact at the end", "push the object")
@@ -331,20 +376,43 @@ def fit(
         "gap": ("push", gaps),
     }
     data_set = xr.Dataset(columns, {"parameter": list(PRIOR)})
-    fitted = ObjectFit(data_set, corners, radius, _QUANTILE)
+    fitted = ObjectFit(data_set, corners, radius, _QUANTILE, pads)
     return fitted if np.isnan(data.end).any() else _calibrated(fitted, data)
 
 
+def _traits(outline: np.ndarray, pushes: Pushes) -> np.ndarray:
+    """Return coordinates (n, 6) of pushes between which a Gaussian process interpolates."""
+    yaw, way = -pushes.start[:, 2], pushes.path[:, -1] - pushes.path[:, 0]
+    way = way / np.maximum(np.linalg.norm(way, axis=1), 1e-9)[:, None]
+    at = (pushes.path[:, 0] - pushes.start[:, :2]) / (np.ptp(outline, axis=0).max() / 2)
+    turned = solid.rotate(yaw, at), solid.rotate(yaw, way), solid.unit(yaw)
+    return np.concatenate([x / near for x, near in zip(turned, _NEAR, strict=True)], axis=1)
+
+
+def _kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the correlation (n, m) of pushes (n, 6) and (m, 6)."""
+    return np.exp(-np.sum((a[:, None] - b) ** 2, axis=2) / 2)
+
+
 def _calibrated(fitted: ObjectFit, data: Pushes) -> ObjectFit:
-    """Return a fit whose quantiles also are those of its own pushes."""
+    """Return a fit that also learns corrections and quantiles from the fitted pushes."""
     pose, slope = fitted._pose_and_slope(data)
     scatter = _scatter(pose, slope, data.start, fitted.data.covariance.values)
-    off, count = errors_of(pose, data.end), len(pose)
+    rest = data.end - pose
+    rest[:, 2] = solid.wrap(rest[:, 2])
+    rest, traits = solid.rotate(-data.start[:, 2], rest), _traits(fitted.outline, data)
+    limit, count = _CUT * 1.5 * np.median(np.abs(rest), axis=0), len(pose)
+    inverse = np.linalg.inv(_kernel(traits, traits) + _NOISE * np.eye(count))
+    cut = np.clip(rest, -limit, limit)
+    weight = inverse @ cut
+    # Each push predicted from the others.
+    alone = rest - cut + weight / np.diag(inverse)[:, None]
+    off = errors_of(alone, np.zeros_like(alone))
     free = count / max(1.0, count - len(PRIOR) / 3)  # parameters take a part of each error
     own = {name: np.sqrt(free) * np.quantile(off[name] / scatter[name], 0.9) for name in off}
     share = count / (count + _PSEUDO)
     quantile = {name: (1 - share) * _QUANTILE[name] + share * own[name] for name in own}
-    return ObjectFit(fitted.data, fitted.outline, fitted.radius, quantile)
+    return replace(fitted, quantile=quantile, nearby=(traits, weight))
 
 
 _UNIT = 1e-3  # [m] scale of Cauchy's loss
@@ -381,6 +449,9 @@ class FitObject(Question[ObjectFit]):
     middle; in Python also a data frame."""
     radius: float = option(0.005, 1e-4, 0.5, unit="m")
     """Radius of the finger."""
+    feet: Any = option(None, kw_only=True)
+    """Known feet x, y [m] (S, 2) of the object, in Python; by default it has pressure under all of
+    its outline."""
     prior: Any = option(None, kw_only=True)
     """Priors (mean, standard deviation) of parameters by name, in Python; by default `PRIOR`."""
 
@@ -390,7 +461,7 @@ class FitObject(Question[ObjectFit]):
             table = Table(Path(outline), f"outline = {outline}", {"x": "m", "y": "m"}.get, {})
             table.require(("x", "y"))
             outline = np.column_stack([table.values_of("x"), table.values_of("y")])
-        return fit(outline, self.pushes, self.radius, self.prior or PRIOR)
+        return fit(outline, self.pushes, self.radius, self.prior or PRIOR, self.feet)
 
     def report(self, results: ObjectFit, run: Run) -> Sequence[Section]:
         data = results.data

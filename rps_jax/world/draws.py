@@ -16,8 +16,8 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.solid import GRAVITY, SIDES, Solid
 from rps_jax.record.files import Arrays
 from rps_jax.robot.robot import Robot
+from rps_jax.world import objects, scene
 from rps_jax.world import quantity as quantities
-from rps_jax.world import scene
 from rps_jax.world.domain import (
     QUANTITIES,
     RANDOM,
@@ -77,10 +77,10 @@ def draw_at(
     Raises:
       ValueError: the worlds are of several objects.
     """
-    objects = domain.object_of(index)
-    if (objects != objects[0]).any():
+    chosen = domain.object_of(index)
+    if (chosen != chosen[0]).any():
         raise ValueError("worlds of several objects cannot be batched")
-    name = domain.objects[int(objects[0])]
+    name = domain.objects[int(chosen[0])]
     ranges = {name: domain.range_of(name) for name in QUANTITIES if name in u}
     at = {name: item.at(u[name]) for name, item in ranges.items() if item is not None}
     at["com_bearing"] = 2 * np.pi * u["com_bearing"]
@@ -127,6 +127,8 @@ def _solid(name: str, at: Arrays, u: Arrays) -> Solid:
     """Return the solids of an object of a scene, or random ones of a shape family."""
     count = u["mass"].size
     if name not in RANDOM:
+        if (guessed := objects.draw_guesses(name, u)) is not None:
+            return guessed
         single = scene.solid_of(scene.load(name))
         return jax.tree.map(lambda leaf: np.repeat(leaf, count, axis=0), single)
     depth, breadth = at["size"] / np.sqrt(at["aspect"]), at["size"] * np.sqrt(at["aspect"])

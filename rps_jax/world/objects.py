@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
+from xml.etree import ElementTree
 
 import jax
 import jax.numpy as jnp
@@ -22,19 +23,31 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.record import files, options
-from rps_jax.record.files import JsonObject
+from rps_jax.record.files import Arrays, JsonObject
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import check_arguments
 from rps_jax.world.opengl import mujoco
 
-FAMILIES = {
-    "box": "box",
-    "cylinder": "cylinder",
-    "nonuniform_box": "box",
-    "hardware_box": "box",
-    "hardware_cylinder": "cylinder",
-}  # object -> shape family
-SHAPES = ("box", "cylinder", "prism")  # the families
+SHAPES = ("box", "cylinder", "prism")  # the shape families
+
+
+def mjcf_folder() -> Path:
+    """Return the folder of the scenes: in an installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parent.parent
+    installed = package / "mjcf"
+    return installed if installed.is_dir() else package.parent / "mjcf"
+
+
+def _families() -> dict[str, str]:
+    """Return the shape families of the objects with a file in `mjcf_folder`, by name."""
+    kinds = {}
+    for path in sorted(mjcf_folder().glob("*.xml")):
+        geom = ElementTree.parse(path).find(".//geom[@name='object']")
+        kinds[path.stem] = "" if geom is None else geom.get("type", "")
+    return {name: kind for name, kind in kinds.items() if kind in SHAPES}
+
+
+FAMILIES = _families()  # object -> shape family
 OBJECTS = FAMILIES.keys()  # grows with registered objects
 PAPER_OBJECTS = ("box", "cylinder", "nonuniform_box")  # Fig. 4, in the order of Table II
 _BUILT_IN = tuple({**FAMILIES, **dict.fromkeys(SHAPES)})
@@ -64,16 +77,44 @@ class Registered(NamedTuple):
 REGISTERED: dict[str, Registered] = {}
 
 
-def mjcf_folder() -> Path:
-    """Return the folder of the scenes: in an installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent.parent
-    installed = package / "mjcf"
-    return installed if installed.is_dir() else package.parent / "mjcf"
-
-
 def path_of(name: str) -> Path:
     """Return the MJCF file of an object, or of the template of a shape family."""
     return REGISTERED[name].path if name in REGISTERED else mjcf_folder() / f"{name}.xml"
+
+
+def guesses_of(name: str) -> np.ndarray | None:
+    """Return the ranges (4, 2) of depth, breadth, height [m] and mass [kg] that a file guesses.
+
+    Raises:
+      InputError: the object is no box, or the ranges are not allowed.
+    """
+    numeric = ElementTree.parse(path_of(name)).find("custom/numeric[@name='guess']")
+    if numeric is None:
+        return None
+    try:
+        ranges = np.array(numeric.get("data", "").split(), float).reshape(4, 2)
+        allowed = FAMILIES[name] == "box" and bool(np.all(ranges[:, 0] > 0))
+        allowed &= bool(np.all(ranges[:, 0] <= ranges[:, 1]) and np.all(ranges < np.inf))
+    except ValueError:
+        allowed, ranges = False, None
+    if not allowed:
+        rule = "give low and high of depth, breadth, height [m] and mass [kg] of a box"
+        raise errors.not_allowed(f"object '{name}': numeric guess", numeric.get("data"), rule)
+    return ranges
+
+
+def draw_guesses(name: str, u: Arrays) -> Solid | None:
+    """Return boxes (n, ...) of guessed sizes and mass, or None if those of the file are known.
+
+    The random numbers `u` (n,) in [0, 1) choose from the ranges.
+    """
+    if (ranges := guesses_of(name)) is None:
+        return None
+    shares = np.stack([u[x] for x in ("size", "aspect", "height", "mass")])
+    depth, breadth, height, mass = ranges[:, :1] + np.diff(ranges) * shares
+    zero = np.zeros_like(mass)
+    outlines = solid.rectangles(depth / 2, breadth / 2)
+    return solid.build(outlines, zero, height, mass, zero, zero, zero)
 
 
 def parse_object(text: str) -> str:
@@ -219,6 +260,7 @@ def register_object(
     single = solid_of_body(body, vertices, radius, _height(label, model))
     REGISTERED[name] = Registered(path, single._replace(feet=feet, pads=pads))
     FAMILIES[name] = family
+    guesses_of(name)
 
 
 def solid_of_body(body: Any, vertices: np.ndarray, radius: float, height: float) -> Solid:

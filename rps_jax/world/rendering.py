@@ -42,6 +42,8 @@ WALL_RGBA = (0.45, 0.47, 0.5, 1.0)
 WALL_HALF = (0.02, 0.15)  # [m] half thickness and half height of a wall in pictures
 CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
 CONTACT_RADIUS = 0.04  # [m]
+PIN = (0.02, 0.5)  # [m] radius and half height of what marks the remembered object
+PIN_RGBA = (0.89, 0.35, 0.08, 1.0)
 _CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))  # of a cube
 NO_CONTACT = np.full(2, np.nan)
 _OPENING = threading.Lock()
@@ -113,10 +115,13 @@ class SceneRenderer:
         middle, half = np.split(scene.model.geom_aabb[self._moving], 2, axis=1)
         self._corners = middle + _CORNERS[:, None] * half  # (8, geoms, 3) [m]
 
-    def draw(self, qpos: ArrayLike, p_world_contact: ArrayLike) -> np.ndarray:
+    def draw(
+        self, qpos: ArrayLike, p_world_contact: ArrayLike, remembered: ArrayLike = NO_CONTACT
+    ) -> np.ndarray:
         """Draw an image (height, width, 3) uint8, and extend the trails.
 
-        While the camera stands still, only the rectangle with moving bodies is drawn again.
+        A pin marks the object's middle (2,) [m] that the law has `remembered`. While the camera
+        stands still, only the rectangle with moving bodies is drawn again.
         """
         qpos = errors.check_array("qpos", qpos, (self.model.nq,))
         contact = np.array(p_world_contact, float)  # a copy: the trail keeps it
@@ -144,17 +149,25 @@ class SceneRenderer:
             position, size = np.array([*contact, CONTACT_HEIGHT]), np.full(3, CONTACT_RADIUS)
             marker = self._add_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
             marker.emission = 1.0  # seen in the shadow of the object too
-        self._draw_changes(np.where(np.isnan(contact), qpos[:2], contact))
+        middle = np.asarray(remembered, float)
+        if not np.isnan(middle).any():
+            size, position = np.array([*PIN, 0]), np.array([*middle, PIN[1]])
+            self._add_geom("mjGEOM_CYLINDER", size, position, PIN_RGBA)
+        marks = np.stack([contact, middle])
+        self._draw_changes(np.where(np.isnan(marks), qpos[:2], marks))
         return self._image.copy()
 
-    def _draw_changes(self, p_world_marker: np.ndarray) -> None:
-        """Draw the rectangle of moving bodies in this and the last image, or all of the image."""
+    def _draw_changes(self, marks: np.ndarray) -> None:
+        """Draw the rectangle of moving bodies and marks (n, 2) [m] in this and the last image.
+
+        If the camera has moved, all of the image is drawn.
+        """
         eye = self.mujoco.mjv_averageCamera(*self.renderer.scene.camera)
         pixel = 2 * eye.frustum_top / self._size[1]  # [m] where the field of view begins
         last_eye, self._eye = self._eye, np.concatenate([eye.pos, eye.forward, eye.up])
         still = np.array_equal(last_eye, self._eye)
         boxes = [self._box if still else np.array([[0, 0], self._size])]
-        away = self._points(p_world_marker) - eye.pos
+        away = self._points(marks) - eye.pos
         depth = 1 if eye.orthographic else away @ eye.forward / eye.frustum_near
         flat = away @ np.transpose([np.cross(eye.forward, eye.up), eye.up])
         flat = self._size / 2 + flat / np.maximum(depth, 1)[..., None] / pixel
@@ -178,14 +191,14 @@ class SceneRenderer:
         drawn = _averaged(drawn)[y - first[1] :, x - first[0] :][: end_y - y, : end_x - x]
         self._image[::-1][y:end_y, x:end_x] = drawn  # OpenGL's rows go up
 
-    def _points(self, p_world_marker: np.ndarray) -> np.ndarray:
-        """Return points (n, 3) [m] around the moving bodies, the marker and their shadows."""
+    def _points(self, marks: np.ndarray) -> np.ndarray:
+        """Return points (m, 3) [m] around the moving bodies, the marks and their shadows."""
         data, moving = self.data, self._moving
         rotation = data.geom_xmat[moving].reshape(-1, 3, 3)
         bodies = np.einsum("gij,cgj->cgi", rotation, self._corners) + data.geom_xpos[moving]
-        half = CONTACT_HEIGHT / 2
-        marker = [*p_world_marker, half] + _CORNERS * (half + CONTACT_RADIUS)
-        points = np.concatenate([bodies.reshape(-1, 3), marker])
+        middles = np.pad(marks, ((0, 0), (0, 1)), constant_values=PIN[1])
+        around = middles + _CORNERS[:, None] * (CONTACT_RADIUS, CONTACT_RADIUS, PIN[1])
+        points = np.concatenate([bodies.reshape(-1, 3), around.reshape(-1, 3)])
         for i, sun in enumerate(data.light_xpos):
             far = self.model.light_type[i] == self.mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
             ray = data.light_xdir[i] if far else points - sun
@@ -282,7 +295,6 @@ def _import_mujoco() -> Any:
 @contextlib.contextmanager
 def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
     mujoco = _import_mujoco()
-    gl_context = mujoco.rendering.classic.gl_context
     width, height = (_FINER * n for n in size)
     buffer, quality = model.vis.global_, model.vis.quality
     with _OPENING:  # a film and stills of one model may be drawn on two threads
@@ -293,7 +305,8 @@ def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
             with warnings.catch_warnings():  # GLFW warns before it fails
                 warnings.simplefilter("ignore")
                 # Without a context, a renderer ends the process on some machines.
-                if not gl_context.GLContext(width, height)._context:
+                opened = mujoco.rendering.classic.gl_context.GLContext(width, height)
+                if not opened._context:
                     raise VideoError(_FIX_GL)
                 renderer = mujoco.Renderer(model, height=height, width=width)
         except Exception as error:  # of any kind, by OpenGL

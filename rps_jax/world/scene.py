@@ -17,7 +17,7 @@ from rps_jax.geometry.solid import Solid
 from rps_jax.record.files import Arrays
 from rps_jax.robot.base import GRIP
 from rps_jax.robot.robot import Robot
-from rps_jax.robot.shell import Shell
+from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH, Shell
 from rps_jax.world import objects
 from rps_jax.world.objects import FAMILIES, OBJECTS, SHAPES, path_of
 from rps_jax.world.opengl import mujoco
@@ -30,6 +30,7 @@ OFF_CENTRE = 1e-6
 WALL_HALF, WALL_TOP = 0.001, 2.5  # [m] half thickness and height of walls, which are sheets
 _WALL_FOOT = -0.5  # [m] their lower edge
 _LEAST_TORQUE = 1e-5  # [m] torsional friction of a point, the least in MuJoCo
+_DECK, _DECK_MARGIN = 0.37, 0.03  # [m] height above which the arm is, and width of the rim
 
 
 class Friction(NamedTuple):
@@ -131,6 +132,7 @@ def load(
     rear: Side = "near",  # side of the nonuniform box's load, the paper's "rear left corner"
     mass: float | None = None,  # [kg], scales the inertia too; None: the object's own mass
     robot: Robot = Robot(),  # a body if its force is limited
+    drawn: Solid | None = None,  # of an object with guesses (leaves without a leading axis)
 ) -> Scene:
     """Compile a scene of an object.
 
@@ -141,13 +143,15 @@ def load(
     errors.check_name("rear", rear, get_args(Side))
     check_contact(friction, mass)
     spec = objects.read(path_of(name))
-    if name in objects.REGISTERED:  # its contacts are those of its solid
-        single = objects.REGISTERED[name].solid
+    if name in objects.REGISTERED or drawn is not None:  # its contacts are those of its solid
+        single = objects.REGISTERED[name].solid if drawn is None else drawn
         if mass is not None:
             inertia = single.inertia * mass / single.mass
             single = single._replace(mass=np.asarray(mass), inertia=inertia)
         upright = compile_solid(FAMILIES[name], single, physics, friction, robot=robot)
         _set_robot(spec, robot)
+        if drawn is not None:
+            _resize(spec, drawn)
         return upright._replace(name=name, model=spec.compile())
     for geom in spec.geoms:
         if geom.name == "load" and rear == "far":
@@ -229,6 +233,15 @@ def base_invweight(robots: Robot) -> np.ndarray:
     It is the mean over x, y and z of the acceleration by a force of 1 N; along z the base is fixed.
     """
     return 2 / (3 * np.asarray(robots.mass, float))
+
+
+def _resize(spec: mujoco.MjSpec, box: Solid) -> None:
+    """Stretch the geoms of an object, of which the geom `object` is a box, to another box."""
+    body, half = spec.body("object"), np.append(box.vertices[0], box.height / 2)
+    ratio = half / spec.geom("object").size
+    body.pos[2] = half[2]
+    for geom in body.geoms:
+        geom.pos, geom.size = geom.pos * ratio, geom.size * ratio
 
 
 def geom_sizes(family: str, solids: Solid) -> Arrays:
@@ -361,6 +374,8 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
         for side, sign in (("left", 1), ("right", -1)):
             spec.geom(f"skin_{side}").size[0] = x
             spec.geom(f"skin_{side}").pos[1] = sign * y
+        if (x, y) != (HALF_LENGTH, HALF_WIDTH):
+            _draw_deck(spec, x, y)
     else:
         _draw_round(spec, robot.shell, x)
     if robot.drive != "omni":
@@ -378,13 +393,22 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
             tyres.wrap_joint(joint.name, coefficient)
 
 
+def _draw_deck(spec: mujoco.MjSpec, x: float, y: float) -> None:
+    """Draw a deck for a base of these half sizes [m], and no arm where it would not fit."""
+    for item in list(spec.body("base").geoms):
+        if item.material == "deck":
+            item.size[:2] = x - _DECK_MARGIN, y - _DECK_MARGIN
+        elif np.nanmax([item.pos[2], item.fromto[2]]) > _DECK and (x < 0.3 or y < 0.25):
+            spec.delete(item)
+
+
 def _draw_axle(spec: mujoco.MjSpec, robot: Robot) -> None:
     """Draw the wheels of an axle in place of omnidirectional ones."""
     base, kind = spec.body("base"), mujoco.mjtGeom
     for item in list(base.geoms):
         if item.material in ("wheel", "hub") and item.type != kind.mjGEOM_CAPSULE:
             spec.delete(item)
-    half = float(robot.half_track)
+    half = min(float(robot.half_track), float(robot.sizes[-1]))  # skid steer: wider than the base
     looks: dict[str, Any] = {"mass": 0, "group": 2, "type": kind.mjGEOM_CYLINDER}
     looks["quat"] = [math.sqrt(0.5), math.sqrt(0.5), 0, 0]  # along y
     parts = ((half, [0.1, 0.03, 0]), (-half, [0.1, 0.03, 0]), (0.0, [0.02, half, 0]))
@@ -459,6 +483,8 @@ def solid_of(scene: Scene) -> Solid:
 
 def width_of(name: str) -> float:
     """Return the greatest width of an object of a scene along its axes [m]."""
+    if (ranges := objects.guesses_of(name)) is not None:
+        return float(ranges[:2].max())
     shape = solid_of(load(name))
     return 2 * float(np.abs(shape.vertices).max() + shape.radius.max())
 

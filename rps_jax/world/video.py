@@ -45,6 +45,7 @@ class Shot(NamedTuple):
     qpos: ArrayLike  # (10,) as for `images`
     p_world_contact: ArrayLike  # (2,) [m], NaN without contact
     label: str
+    remembered: ArrayLike = NO_CONTACT  # (2,) [m] object's middle, NaN if the law remembers none
 
 
 def check() -> dict[str, str]:
@@ -142,7 +143,7 @@ def render(
 
 def _labelled(renderer: SceneRenderer, shot: Shot) -> np.ndarray:
     """Draw a tile; a label adds a text on a plate, as large as fits, and a frame."""
-    drawn = renderer.draw(shot.qpos, shot.p_world_contact)
+    drawn = renderer.draw(shot.qpos, shot.p_world_contact, shot.remembered)
     if not shot.label:
         return drawn
     image = Image.fromarray(drawn)

@@ -1,6 +1,6 @@
 """Bases that cannot move sideways in another engine: outcomes that equal those in C MuJoCo.
 
-rps sweeps/drives/engines.py --worlds 60
+rps sweeps/drives/engines.py
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import ClassVar
 import xarray as xr
 
 from rps_jax.analysis import tables
-from rps_jax.questions import Plan, call_of
+from rps_jax.questions import Plan, call_of, option
 from sweeps.drives.study import Drives
 from sweeps.study_base import Table
 
@@ -37,6 +37,8 @@ class DriveEngines(Drives):
     """Names of bases."""
     domains: Sequence[str] = ("wide",)
     """Names of domains."""
+    worlds: int = option(300, 2, 10_000_000)
+    """Number of worlds of each domain."""
 
     @cached_property
     def plans(self) -> dict[str, Plan]:

@@ -1,6 +1,6 @@
 """Bases that cannot move sideways: success and time by drive, axle and domain, in equal worlds.
 
-rps sweeps/drives --worlds 10000
+rps sweeps/drives
 """
 
 from __future__ import annotations
@@ -52,6 +52,11 @@ BASES: dict[str, Base] = {
     "skin on the front only": Base(str(FRONT_SKIN), "unicycle_front"),
 }
 DOMAINS = ("wide", "real", "hostile")
+TASKS = {  # in the worlds of `wide`
+    "paths": "path",
+    "corridors of 2 m": "corridor,width=2",
+    "corridors of 2 m, lookahead 1 m": "corridor,width=2,lookahead=1",
+}
 
 
 @dataclass(frozen=True)
@@ -63,15 +68,17 @@ class Drives(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Bases that cannot move sideways"
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32}
-    CHOICES: ClassVar = {"bases": BASES, "domains": DOMAINS}
+    CHOICES: ClassVar = {"bases": BASES, "domains": (*DOMAINS, *TASKS)}
 
     bases: Sequence[str] = (OMNI, *(x for x in BASES if "holonomic" not in x))
     """Names of bases."""
     domains: Sequence[str] = DOMAINS
-    """Names of domains."""
+    """Names of domains, or of tasks in `wide`: paths, corridors of 2 m with a lookahead."""
     worlds: int = option(10000, 2, 10_000_000)
     """Number of worlds of each domain."""
-    setting: Setting = field(default=Setting("fused", seed=8123), kw_only=True)
+    file: str = "drives"
+    """Name of the data file."""
+    setting: Setting = field(default=Setting("fused", seed=9241), kw_only=True)
 
     @cached_property
     def plans(self) -> dict[str, Plan]:
@@ -80,7 +87,8 @@ class Drives(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
         for domain, name in product(self.domains, self.bases):
             robot, law, rules = BASES[name]
             setting = replace(self.setting, rules=rules or self.setting.rules)
-            plans[f"{domain} | {name}"] = plan_of(law, domain, self.worlds, setting, robot)
+            world = ("wide" if domain in TASKS else domain), self.worlds, setting, robot
+            plans[f"{domain} | {name}"] = plan_of(law, *world, TASKS.get(domain))
         return plans
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -103,7 +111,8 @@ class Drives(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return success and times of each row."""
         limit = float(self.setting.rules.max_lost)
-        return [Table(drive_table(results, limit), name="drives", merge="domain", title="Drives")]
+        table = drive_table(results, limit)
+        return [Table(table, name=self.file, merge="domain", title="Drives")]
 
 
 drives = call_of(Drives)

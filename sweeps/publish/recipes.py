@@ -283,7 +283,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "straight": recipe(f"rps sweeps/ground/straight.py {_MACHINE}", cores=4),
     "support*": recipe(
-        f"rps sweeps/ground/support.py --worlds 120 --hardware 16 {_MACHINE}", cores=1
+        f"rps sweeps/ground/support.py --worlds 1000 --repeats 6 {_MACHINE}", cores=1
     ),
     "force_push_grid": recipe("rps sweeps/force_push_grid", cores=4, section="Pushes that succeed"),
     "mends": recipe(
@@ -317,15 +317,30 @@ RECIPES: dict[str, Recipe] = {
     **dict.fromkeys(
         ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 10000 {_MACHINE}", gpu=2)
     ),
-    "drives": recipe(f"rps sweeps/drives --worlds 4000 {_MACHINE}", cores=14, gpu=6),
+    "drives": recipe(f"rps sweeps/drives {_MACHINE}", cores=35, gpu=6),
     "drives_omni": recipe(
-        "rps sweeps/drives --worlds 4000 --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "
-        f"'round, holonomic, rps_plus' 'round, holonomic, rps_reposition' {_MACHINE}",
-        cores=6,
+        "rps sweeps/drives --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "
+        "'round, holonomic, rps_plus' 'round, holonomic, rps_reposition' --file drives_omni "
+        + _MACHINE,
+        cores=15,
         gpu=5,
-        section="Drives",
     ),
-    "drives_engines": recipe(f"rps sweeps/drives/engines.py --worlds 60 {_MACHINE}", cores=15),
+    "drives_tasks": recipe(
+        "rps sweeps/drives --domains paths 'corridors of 2 m' 'corridors of 2 m, lookahead 1 m' "
+        f"--bases 'holonomic, rps_plus' differential --file drives_tasks {_MACHINE}",
+        gpu=4,
+    ),
+    "drives_engines": recipe(f"rps sweeps/drives/engines.py {_MACHINE}", cores=40, gpu=4),
+    "drives_learned": recipe(
+        "rps learn --robot ideal,drive=differential --domain wide --num-envs 1024 --drawn 8192 "
+        "--horizon 180 --max-lost 60 --discount-time 60 --gae-time 10 --minutes 6.2 "
+        "--out runs/learn_differential",
+        "rps sweep --domain wide --robot ideal,drive=differential --worlds 1000 --seed 9242 "
+        "--laws unicycle runs/learn_differential/policy.npz --out runs/learned_differential",
+        gpu=8,
+        section="Success",
+        columns=_RATES,
+    ),
     "corridors_*": recipe(
         "rps sweeps/corridors --laws rps rps_tuned rps_plus learned force_push dipole aps "
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",

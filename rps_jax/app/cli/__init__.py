@@ -4,6 +4,8 @@
 JAX nor MuJoCo. `flags` parses the options, and `running` checks them before anything compiles.
 """
 
+import atexit
+import contextlib
 import os
 import sys
 from collections.abc import Sequence
@@ -13,17 +15,26 @@ from rps_jax.app.cli import environment, names, running
 
 
 def run() -> NoReturn:
-    """Run `rps` as a process, which ends at once if it was interrupted.
+    """Run `rps` as a process, which ends without taking Python down, and at once if interrupted.
 
-    Threads of XLA may still be compiling then, and can crash while Python is taken down.
+    To take it down takes half a second, and threads of XLA that still compile can crash meanwhile.
     """
+    codes = list[int]()
+    atexit.register(_end, codes)  # the first that is registered runs last
     environment.start_process()
-    code = main()
-    if code == 130:
-        sys.stdout.flush()
-        sys.stderr.flush()
+    codes.append(main())
+    if codes == [130]:
+        _end(codes)
+    sys.exit(*codes)
+
+
+def _end(codes: Sequence[int]) -> None:
+    """End the process with an exit code, if there is one."""
+    for code in codes:
+        with contextlib.suppress(OSError):  # nobody reads the output
+            sys.stdout.flush()
+            sys.stderr.flush()
         os._exit(code)
-    sys.exit(code)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

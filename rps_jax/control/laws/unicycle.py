@@ -355,7 +355,7 @@ LAW = Law(
     bounds=bounds_of(UnicycleParams),
     temperatures=Widths(),
     drives=("omni", "differential", "car"),
-    room=1.5,
+    room=1.0,
 )
 _TUNED = UnicycleParams()
 PRESETS = {

@@ -71,6 +71,8 @@ class CorridorCourse(NamedTuple):
     walls: Float[Array, "*B W 2 2"]  # [m] both ends of each
     # Of an object that may touch walls: fields of `scene.Surroundings`.
     surroundings: dict[str, Any] | None = None
+    # [m] from the path, within which there are no other walls; what gets beyond it touches one.
+    reach: Floats | None = None
 
     @classmethod
     def around(
@@ -119,6 +121,12 @@ class CorridorCourse(NamedTuple):
             (of_base, at_base), (of_object, at_object) = (
                 polyline.clearance(x, walls) for x in outlines_at(poses)
             )
+            if self.reach is not None:
+                bounds = (-jnp.inf, jnp.inf)
+                away = [polyline.nearest(self.path.line, pose[:2], *bounds)[1] for pose in poses]
+                of_base, of_object = jnp.minimum(
+                    jnp.stack([of_base, of_object]), self.reach - jnp.stack(away) - radii
+                )
             room = of_object if self.surroundings is None else of_object + _PRESSED
             by_base = of_base <= room
             least = jnp.where(by_base, of_base, room)

@@ -2,7 +2,8 @@
 
 The map has metres and a frame of its own. The world is the frame of the base at its start: it is at
 the origin and looks along x. The path is the shortest of a visibility graph around the corners of
-the walls, by Dijkstra's algorithm of `scipy.sparse.csgraph`. Points are complex numbers here.
+the walls, by Dijkstra's algorithm of `scipy.sparse.csgraph`; in a map of more than 128 walls, that
+of a grid, straightened. Points are complex numbers here.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ _ROS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thre
 _IGNORED = ("map_type", "frame_id")
 _UNKNOWN = 205  # grey of unknown cells, as maps are saved
 _OUTSIDE = "it lies in an obstacle or outside of the room (of an image, try a smaller tolerance)"
-_MAX_WALLS = 128
+_MAX_WALLS = 4096
+_NEAR = 128  # walls of a world: those nearest to its path, if the map has more
+_MAX_CELLS = 1_000_000  # of the grid on which a path between more walls is planned
 _TURN_BOUNDS = {"at_least": -6.3, "at_most": 6.3, "unit": "rad"}  # no angle in degrees
 _MAX_PIXELS = 16_000_000
 # Vertices of a path around a corner, by the clearance: up to 1.08 times the clearance from it. An
@@ -51,13 +54,13 @@ class Rooms(Following):
     """Follow a planned path between the obstacles of a map.
 
     Instead of walls, a mapping has `polygons`, each with its corners [m], the `outline` of a room,
-    or the fields of a ROS map, with a `tolerance` [m].
+    or the fields of a ROS map, with a `tolerance` [m], an area of `specks` [m^2] and a `crop`.
     """
 
     kind: str = "rooms"
     OUTCOMES = Corridor.OUTCOMES
     FAILURES = Corridor.FAILURES
-    MARKS = ("polygons", "outline", *_ROS, "tolerance", *_IGNORED)
+    MARKS = ("polygons", "outline", *_ROS, "tolerance", "specks", "crop", *_IGNORED)
     NUMBERS = ("route",)
 
     lookahead: Annotated[Range, LOOKAHEAD] = Corridor.lookahead
@@ -105,8 +108,9 @@ class Rooms(Following):
 
     @property
     def shape(self) -> Hashable:
-        """Kind, and numbers of routes, vertices and walls."""
-        return self.kind, self._routes.shape, len(self.walls)
+        """Kind, numbers of routes, vertices and walls, and whether a world has all of these."""
+        near, reach = self._near
+        return self.kind, self._routes.shape, near.shape, reach is None
 
     @property
     def idle(self) -> frozenset[str]:
@@ -119,6 +123,22 @@ class Rooms(Following):
         map_ = (tuple(map(tuple, x)) for x in (self.walls, self.start, self.goal))
         radii = self.base_radius / self.scale.low, self.object_radius / self.scale.low
         return _plan(*map_, *radii)
+
+    @property
+    def _near(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """Ends (R, 2 W) [m] of the walls nearest to each route, and how far others are (R,) [m].
+
+        The latter is None if there are no others.
+        """
+        walls = np.array(self.walls) @ (1, 1j)
+        if walls.size <= 2 * _NEAR:
+            return np.tile(walls, (len(self._routes), 1)), None
+        pairs = walls.reshape(-1, 2)
+        lines = self._routes[:, :, None]
+        away = [distances(x[:-1], x[1:], *pairs.T).min(axis=0) for x in lines]
+        order = np.argsort(away, axis=1, kind="stable")
+        others = np.take_along_axis(np.array(away), order[:, _NEAR, None], axis=1)
+        return pairs[order[:, :_NEAR]].reshape(len(order), -1), others[:, 0]
 
     def check(self) -> None:
         """Raise InputError for a map without a way from each start to each goal."""
@@ -133,7 +153,12 @@ class Rooms(Following):
                 raise errors.not_allowed(f"task {name}", value, rule)
         for _, _, yaw in self.start:
             errors.check_finite("yaw of task start", yaw, **_TURN_BOUNDS)
-        _ = self._routes
+        _, reach = self._near
+        least = 2 * (self.base_radius + self.object_radius)
+        if reach is not None and reach.min() < least:
+            rule = f"the {_NEAR} nearest to the path reach {reach.min():.2g} m from it, and must "
+            fix = f"reach {least:.2g} m: give a larger tolerance [m] of an image, or specks [m2]"
+            raise errors.not_allowed("task walls", f"{count:g}", rule + fix)
 
     @property
     def free_room(self) -> float:
@@ -158,9 +183,11 @@ class Rooms(Following):
         vertices = _placed(self._routes[route], starts, scale)
         # The first two are at the start, and straight ahead: the path begins at the base's front.
         vertices[:, :2, 0] = np.maximum(vertices[:, :2, 0], inputs.front[:, None])
-        walls: Any = _placed(np.array(self.walls) @ (1, 1j), starts, scale)
+        near, reach = self._near
+        walls: Any = _placed(near[route], starts, scale).reshape(route.size, -1, 2, 2)
         path = PathCourse(Polyline.through(vertices), lookahead)
-        return vertices[:, -1], CorridorCourse(path, walls.reshape(route.size, -1, 2, 2))
+        course = CorridorCourse(path, walls, reach=None if reach is None else reach[route] * scale)
+        return vertices[:, -1], course
 
 
 def _placed(points: np.ndarray, starts: np.ndarray, scale: Any) -> np.ndarray:
@@ -208,9 +235,16 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
     shades = _shades(Path(str(file.get("image", "an image"))))[::-1]
     occupied = shades if texts["negate"] in ("1", "true") else 1 - shades
     # Unknown cells, and those outside, are walls.
-    labelled: Any = scipy.ndimage.label((occupied < low) & (occupied <= high))
-    labels = np.pad(labelled[0], 1)
+    free = (occupied < low) & (occupied <= high)
     unit, origin = resolution * np.exp(1j * yaw), complex(x, y)
+    if "crop" in file:
+        left, bottom, right, top = errors.check_array("task crop", file["crop"], (4,))
+        rows, columns = np.indices(free.shape)
+        cells = origin + unit * (columns + 0.5 + 1j * (rows + 0.5))
+        free &= (left <= cells.real) & (cells.real <= right)
+        free &= (bottom <= cells.imag) & (cells.imag <= top)
+    labelled: Any = scipy.ndimage.label(free)
+    labels = np.pad(labelled[0], 1)
     cells = (errors.check_array("task start", starts, ("N", 3)) @ (1, 1j, 0) - origin) / unit + 1
     indices = np.floor([cells.imag, cells.real]).astype(int)
     reached = labels[tuple(np.clip(indices, 0, np.array(labels.shape)[:, None] - 1))]
@@ -219,7 +253,10 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
         raise errors.not_allowed("task start", starts, rule)
     free = np.isin(labels, reached)
     obstacles: Any = scipy.ndimage.label(~free, np.ones((3, 3)))
-    _check_count(2 * obstacles[1])  # each has two walls or more
+    specks = check("task specks", file.get("specks", 0), at_most=10, unit="m2") / resolution**2
+    areas = np.bincount(obstacles[0].ravel())[1:]
+    free |= np.append(False, areas <= specks)[obstacles[0]]
+    _check_count(2 * int((areas > specks).sum()))  # each has two walls or more
     if share := 100 * np.mean(abs(255 * np.pad(shades, 1)[free] - _UNKNOWN) < 0.5):
         _warn_once(
             f"{share:.2g} % of the free cells of the map have the grey {_UNKNOWN} of unknown "
@@ -278,8 +315,8 @@ def _simplify(points: np.ndarray, tolerance: float) -> np.ndarray:
 def _check_count(count: float) -> None:
     """Raise InputError for too many walls."""
     if count > _MAX_WALLS:
-        fewer = "give a larger tolerance [m] of an image, remove its specks, give fewer corners"
-        rule = f"at most {_MAX_WALLS} are allowed: {fewer}, or a part of the map"
+        fewer = "give a larger tolerance [m] of an image, specks=0.1 [m2] to leave out small ones"
+        rule = f"at most {_MAX_WALLS} are allowed: {fewer}, or crop=LEFT:BOTTOM:RIGHT:TOP [m]"
         raise errors.not_allowed("task walls", f"at least {count:g}", rule)
 
 
@@ -308,14 +345,8 @@ def _plan(walls: Any, starts: Any, goals: Any, base_radius: float, radius: float
         ):
             if is_bad:
                 raise errors.not_allowed(f"task {'start' if is_start else 'goal'}", value, rule)
-    around = (np.unique([a, b])[:, None] + clearance * _TURN).ravel()
-    is_clear = distances(around[:, None], around[:, None], a, b).min(axis=1) > clearance
-    nodes = np.append(nodes, around[is_clear])
-    lengths = np.full((nodes.size, nodes.size), np.inf)
-    for i, node in enumerate(nodes):
-        is_clear = distances(node, nodes[:i, None], a, b).min(axis=1) > clearance - 1e-9
-        lengths[i, :i] = np.where(is_clear, abs(nodes[:i] - node), np.inf)
-    graph = scipy.sparse.csgraph.csgraph_from_dense(lengths, np.inf)
+    is_large = a.size > _NEAR
+    nodes, graph = (_grid if is_large else _sight_lines)(nodes, a, b, clearance)
     result: Any = scipy.sparse.csgraph.dijkstra(
         graph, False, range(begin.size), return_predecessors=True
     )
@@ -328,9 +359,76 @@ def _plan(walls: Any, starts: Any, goals: Any, base_radius: float, radius: float
             raise errors.not_allowed("task goal", goals[j], f"{rule}: {fix}")
         while route[-1] != i:
             route.append(int(result[1][i, route[-1]]))
-        routes.append(np.append(begin[i], nodes[route[::-1]]))
+        path = nodes[route[::-1]]
+        routes.append(np.append(begin[i], _straighten(path, a, b, clearance) if is_large else path))
     size = max(map(len, routes))
     return np.array([np.pad(route, (0, size - len(route)), "edge") for route in routes])
+
+
+def _sight_lines(nodes: np.ndarray, a: Any, b: Any, clearance: float) -> tuple[np.ndarray, Any]:
+    """Return nodes with those about the corners of walls, and the graph of their sight lines."""
+    around = (np.unique([a, b])[:, None] + clearance * _TURN).ravel()
+    is_clear = distances(around[:, None], around[:, None], a, b).min(axis=1) > clearance
+    nodes = np.append(nodes, around[is_clear])
+    lengths = np.full((nodes.size, nodes.size), np.inf)
+    for i, node in enumerate(nodes):
+        is_clear = distances(node, nodes[:i, None], a, b).min(axis=1) > clearance - 1e-9
+        lengths[i, :i] = np.where(is_clear, abs(nodes[:i] - node), np.inf)
+    return nodes, scipy.sparse.csgraph.csgraph_from_dense(lengths, np.inf)
+
+
+def _grid(nodes: np.ndarray, a: Any, b: Any, clearance: float) -> tuple[np.ndarray, Any]:
+    """Return nodes with the clear points of a grid, and the graph of their eight neighbours."""
+    low, size = complex(a.real.min(), a.imag.min()), (np.ptp(a.real), np.ptp(a.imag))
+    cell = max(clearance / 5, np.sqrt(np.prod(size) / _MAX_CELLS))
+    x, y = (np.arange(0, n, cell) for n in size)
+    points = low + x[:, None] + 1j * y
+    # Between two neighbours, a wall may be nearer by the second term.
+    free = _away_from_walls(points, a, b, clearance) > clearance + cell**2 / (4 * clearance)
+    numbers = np.where(free, nodes.size + np.cumsum(free).reshape(free.shape) - 1, -1)
+    edges = list[np.ndarray]()
+    for first, second in (
+        (numbers[1:], numbers[:-1]),
+        (numbers[:, 1:], numbers[:, :-1]),
+        (numbers[1:, 1:], numbers[:-1, :-1]),
+        (numbers[1:, :-1], numbers[:-1, 1:]),
+    ):
+        edges.append(np.stack([first, second])[:, (first >= 0) & (second >= 0)])
+    inner = points[free]
+    for i, node in enumerate(nodes):
+        near = np.argsort(abs(inner - node))[:32]
+        is_clear = distances(node, inner[near, None], a, b).min(axis=1) > clearance - 1e-9
+        near = near[is_clear] + nodes.size
+        edges.append(np.stack([np.full_like(near, i), near]))
+    every, (first, second) = np.append(nodes, inner), np.concatenate(edges, axis=1)
+    lengths = abs(every[first] - every[second])
+    return every, scipy.sparse.csr_array((lengths, (first, second)), shape=2 * (every.size,))
+
+
+def _away_from_walls(points: np.ndarray, a: Any, b: Any, clearance: float) -> np.ndarray:
+    """Return lower bounds [m] of the distances of points from walls, infinite beyond twice this.
+
+    They are lower by at most a hundredth of the clearance.
+    """
+    step = np.sqrt(0.08) * clearance
+    marks = [np.linspace(p, q, 2 + int(abs(q - p) / step)) for p, q in zip(a, b, strict=True)]
+    tree = scipy.spatial.KDTree(np.concatenate(marks).view(float).reshape(-1, 2))
+    pairs = np.ascontiguousarray(points).view(float).reshape(-1, 2)
+    away = tree.query(pairs, distance_upper_bound=2 * clearance)[0].reshape(points.shape)
+    return np.sqrt(np.maximum(away**2 - step**2 / 4, 0))
+
+
+def _straighten(path: np.ndarray, a: Any, b: Any, clearance: float) -> np.ndarray:
+    """Return those points (N,) of a path that straight lines clear of walls join."""
+    kept, i = [0], 0
+    while i < path.size - 1:
+        low, high = i + 1, path.size  # the line to the point `low` is clear
+        while high - low > 1:
+            middle = (low + high) // 2
+            is_clear = distances(path[i], path[middle], a, b).min() > clearance - 1e-9
+            low, high = (middle, high) if is_clear else (low, middle)
+        kept.append(i := low)
+    return path[kept]
 
 
 TASK = Rooms
