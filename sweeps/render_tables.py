@@ -76,7 +76,6 @@ STALE: dict[str, str] = {
             "gradients_race",
             "gradients_race_18",
             "gradients_stiff",
-            "pose_parity",
         ),
         "a sum in the solver got its former order back, with other last bits",
     ),
