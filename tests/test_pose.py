@@ -248,21 +248,46 @@ def test_the_law_delivers_boxes_to_poses_and_ends_each_trial():
 
 
 def last_twist(law, weight, K_y, y):
-    """Return the twist (3,) after 30 steps of contact with a face that is off the line by y [m].
+    """Return the twist (3,) of `pushed`."""
+    return pushed(law, weight, K_y, y)[1]
 
-    The contact of the last step has a weight.
+
+def pushed(law, weight, K_y, y, x=0.3625):
+    """Return the state and the twist (3,) after 30 steps with a face that is off the line by y [m].
+
+    The contact is at x [m] ahead, and in the last step it has a weight.
     """
     params = PoseParams(K_y=K_y)
     truth = jnp.ones((), weight.dtype)
     target = jnp.array([2.0, y])
-    touch = Observation(jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, 0.0]), truth, target)
+    touch = Observation(jnp.zeros(2), jnp.zeros(()), jnp.array([x, 0.0]), truth, target)
     touch = touch._replace(yaw_target=jnp.zeros(()))
     ends, seen = jnp.array([0.15, -0.15]), jnp.ones(2, bool)
     signals = jnp.zeros(42), jnp.ones(42, bool)
     obs = EndsObservation(touch, *signals, ends, seen, seen[0], jnp.asarray(0.3625))
     state = jax.lax.fori_loop(0, 29, lambda _, s: law.step(params, s, obs)[0], law.init(params))
     obs = obs._replace(touch=touch._replace(in_contact=weight))
-    return jnp.stack(law.step(params, state, obs)[1])
+    state, twist, _ = law.step(params, state, obs)
+    return state, jnp.stack(twist)
+
+
+def test_a_flush_face_turns_about_a_point_beside_the_middle_of_the_box():
+    law, params = registry.law_of(PoseParams()), PoseParams()
+    push = jax.jit(lambda y: last_twist(law, jnp.ones((), bool), 0.0, y))
+    sharpest = params.turn * 0.15 / (0.15**2 + params.r**2)
+    for y in (0.004, 0.02, -0.02, 0.2):
+        v_x, v_y, omega = map(float, push(jnp.asarray(y)))
+        assert_allclose(v_y + omega * (0.3625 + params.r), 0, atol=1e-6)
+        assert np.sign(omega) == np.sign(y)
+        assert abs(omega / v_x) < sharpest + 1e-5
+        assert math.hypot(v_x, v_y) < 0.05 + 1e-6
+    assert omega / v_x == pytest.approx(sharpest, rel=1e-4)
+
+
+def test_a_contact_around_both_corners_of_the_front_is_a_push():
+    law = registry.law_of(PoseParams())
+    state, _ = jax.jit(lambda x: pushed(law, jnp.ones((), bool), 0.2, 0.01, x))(0.3399)
+    assert int(state.mode) == 0
 
 
 def test_the_smooth_law_mixes_its_pushes_by_the_weight_of_the_contact():
@@ -271,7 +296,8 @@ def test_the_smooth_law_mixes_its_pushes_by_the_weight_of_the_contact():
     inputs = 0.2, jnp.asarray(0.01)
     expected = jax.jit(last_twist, static_argnums=0)(hard, jnp.ones((), bool), *inputs)
     assert expected[0] > 0
-    assert_allclose(expected[1], 0.2 * 0.01, rtol=0.2)
+    slide = expected[1] + expected[2] * (0.3625 + PoseParams().r)
+    assert_allclose(slide, 0.2 * 0.01, rtol=0.2)
     weigh = jax.jit(lambda w, K: last_twist(smooth, w, K, inputs[1]))
     assert_allclose(weigh(jnp.asarray(1.0), 0.2), expected, atol=1e-7)
     slopes = jax.jit(jax.jacfwd(lambda w, K: last_twist(smooth, w, K, inputs[1]), (0, 1)))

@@ -313,9 +313,9 @@ RECIPES: dict[str, Recipe] = {
         gpu=2,
         section="Flat against round",
     ),
-    "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 60 {_MACHINE}", cores=10),
+    "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 300 {_MACHINE}", cores=10),
     **dict.fromkeys(
-        ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 800 {_MACHINE}", cores=20)
+        ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 10000 {_MACHINE}", gpu=2)
     ),
     "drives": recipe(f"rps sweeps/drives {_MACHINE}", cores=35, gpu=6),
     "drives_omni": recipe(
