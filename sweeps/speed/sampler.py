@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from types import FrameType
 
 PERIOD = 0.005  # [s] between samples
@@ -33,14 +34,22 @@ def names_of(frame: FrameType | None) -> tuple[str, ...]:
     return tuple(reversed(names))
 
 
-def sample(thread: int, seconds: dict[tuple[str, ...], float]) -> None:
-    """Add the time since the last sample to the present stack of a thread, until Python ends."""
-    last = time.perf_counter()
+def sample(thread: int, seconds: dict[tuple[str, ...], float], write: Callable[[], None]) -> None:
+    """Add the time since the last sample to the present stack of a thread, until Python ends.
+
+    The command ends Python in the first function that it registers for the end, which runs last:
+    so that which writes the samples is registered after it.
+    """
+    last, running = time.perf_counter(), False
     while True:
         time.sleep(PERIOD)
         now = time.perf_counter()
-        seconds[names_of(sys._current_frames().get(thread))] += now - last
+        names = names_of(sys._current_frames().get(thread))
+        seconds[names] += now - last
         last = now
+        if not running and "rps_jax.app.cli.main" in names:
+            running = True
+            atexit.register(write)
 
 
 def main() -> None:
@@ -54,8 +63,7 @@ def main() -> None:
         with open(file, "w") as stream:
             json.dump([begun, time.time(), list(dict(seconds).items())], stream)
 
-    atexit.register(write)
-    inputs = threading.get_ident(), seconds
+    inputs = threading.get_ident(), seconds, write
     threading.Thread(target=sample, args=inputs, daemon=True).start()
     sys.argv[1:] = arguments
     runpy.run_module("rps_jax", run_name="__main__")
