@@ -103,7 +103,6 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "rare*": ("rare", "wide"),
     "regression": ("regress",),
     "sensitivity": ("sensitivity", "hostile", "real"),
-    "fit_real*": ("real_pushes", "tune_es"),
     "fit_*": ("push_fused", "wide", "tune_es"),
     "real_pushes_*": ("real_pushes",),
     "gradients_*": ("tune_grad", "learn"),

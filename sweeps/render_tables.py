@@ -55,8 +55,6 @@ STALE: dict[str, str] = {
             "fit_methods",
             "fit_methods_quantities",
             "fit_quantities",
-            "fit_real",
-            "fit_real_quantities",
             "fit_worth",
             "landscape",
             "learned_continued",

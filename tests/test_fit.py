@@ -31,8 +31,6 @@ from rps_jax.tuning import fit, logs, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import points
 from sweeps.fit import bags, least_squares, methods, windows
-from sweeps.real_pushes import fit as real
-from sweeps.real_pushes import problem
 
 SHELL = Robot().shell
 
@@ -535,38 +533,3 @@ def test_methods_are_compared_on_the_logs_that_all_fit():
     everything = [("neural", "4", "100.0 %"), ("gradient", "4", "100.0 %")]
     common = [(method, "2", "100.0 %") for method in methods.METHODS]
     assert counts == everything + common
-
-
-# --- real pushes ---------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def cells():
-    """Return the cells of real pushes, with six pushes of each half."""
-    return {
-        label: problem.Cell.of(rows)
-        for label, rows in real.Real(few=6, groups=real.GROUPS).tables.items()
-    }
-
-
-@pytest.mark.parametrize("group", ["point, three feet", "two-point, three feet", "two-point, flat"])
-def test_derivatives_of_real_pushes_are_those_of_differences(group, cells):
-    """The bound holds for turns, too, whose ends hardly depend on the centre of pressure."""
-    cell = next(cell for name, cell in cells.items() if name.startswith(group))
-    theta, step = np.array([0.42, 0.3, 0.003, -0.002]), np.diag([1e-5, 1e-5, 1e-6, 1e-6])
-    high, low = np.split(cell.residuals(cell.simulate(np.r_[theta + step, theta - step])[0]), 2)
-    differences = np.moveaxis(high - low, 0, -1) / (2 * step.sum(axis=0))
-    error = np.linalg.norm(cell.derivatives(theta) - differences, axis=(1, 2))
-    error /= np.maximum(1, np.linalg.norm(differences, axis=(1, 2)))
-    assert np.median(error) < 2e-3
-    assert error.max() < 0.03  # the tolerance of the force balance, which differences amplify
-
-
-@pytest.mark.parametrize("method", ["least squares", "CMA-ES"])
-def test_methods_recover_the_world_of_simulated_pushes(method, cells):
-    cell, theta = next(iter(cells.values())), np.array([0.42, 0.3, 0.004, -0.003])
-    cell = cell._replace(measured=cell.simulate(theta[None])[0][0])
-    fitted = real.METHODS[method](cell, 32)
-    scale = np.array([0.05, 0.01, 0.003, 0.003])
-    assert_allclose(fitted.theta / scale, theta / scale, rtol=0, atol=1)
-    assert (np.diag(fitted.covariance) < (problem.HIGH - problem.LOW) ** 2 / 12).all()

@@ -35,7 +35,6 @@ UNKNOWN = [
     "fidelity --conditions fine",
     "ambiguities --readings none",
     "real_pushes --models rigid",
-    "real_pushes/fit.py --groups flat",
     "planning --methods newton",
 ]
 REFUSED = [

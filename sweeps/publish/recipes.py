@@ -382,7 +382,6 @@ RECIPES: dict[str, Recipe] = {
     "fit_one_push": recipe(f"rps sweeps/fit/one_push.py {_MACHINE}", cores=20),
     "fit_methods*": recipe(f"rps sweeps/fit/methods.py {_MACHINE}", cores=25),
     "mit*": recipe(f"rps sweeps/real_pushes/mit --data FOLDER {_MACHINE}", cores=30),
-    "fit_real*": recipe(f"rps sweeps/real_pushes/fit.py {_MACHINE}", cores=12),
     "export_*": recipe(
         f"rps sweeps/export --tables speed {_MACHINE}",
         f"rps sweeps/export --tables trials paper worlds bags odd {_MACHINE}",
