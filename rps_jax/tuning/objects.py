@@ -90,6 +90,11 @@ class Pushes(NamedTuple):
     start: np.ndarray  # (n, 3) [m, m, rad] measured pose of the object before
     end: np.ndarray  # (n, 3) after; NaN where unknown
 
+    def start_gaps(self, outline: ArrayLike, radius: float) -> np.ndarray:
+        """Return the gaps (n,) [m] between outline and finger at the start, negative inside."""
+        points = solid.rotate(-self.start[:, 2], self.path[:, 0] - self.start[:, :2])
+        return finger.distances(outline, points) - radius
+
 
 PushesLike = str | Path | pd.DataFrame | Pushes
 

@@ -27,8 +27,6 @@ from scipy.io import loadmat
 from scipy.optimize import linear_sum_assignment
 
 from rps_jax import InputError, fit_object
-from rps_jax.engines import finger
-from rps_jax.geometry.solid import rotate
 from rps_jax.questions import Run, call_of, option
 from rps_jax.tuning import objects
 from rps_jax.tuning.objects import PRIOR, Pushes
@@ -169,9 +167,7 @@ def _clean_split(folder: Path, label: str, cell: Cell) -> tuple[Cell, np.ndarray
 
 def _unbroken(cell: Cell, rows: np.ndarray) -> np.ndarray:
     """Return the rows whose finger does not start within the object."""
-    start, path = cell.pushes.start[rows], cell.pushes.path[rows]
-    local = rotate(-start[:, 2], path[:, 0] - start[:, :2])
-    return rows[finger.distances(cell.outline, local) - cell.radius > -_INSIDE]
+    return rows[cell.pushes.start_gaps(cell.outline, cell.radius)[rows] > -_INSIDE]
 
 
 def _order(cell: Cell, draw: int) -> np.ndarray:
