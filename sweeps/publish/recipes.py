@@ -428,6 +428,7 @@ RECIPES: dict[str, Recipe] = {
         section="Simulated seconds in a second",
     ),
     "commands": recipe(f"rps sweeps/speed/commands.py {_MACHINE}", cores=14),
+    "stages": recipe(f"rps sweeps/speed/stages.py {_MACHINE}", cores=1),
     "compilers": recipe(f"rps sweeps/speed/compilers.py {_MACHINE}", cores=5),
     "compilers_gpu": recipe(
         f"rps sweeps/speed/compilers.py --against cpu --worlds 4000 --file compilers_gpu "

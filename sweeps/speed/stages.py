@@ -37,7 +37,7 @@ STAGES = {
     "devices": ("jax._src.xla_bridge.backends", "jax._src.xla_bridge.local_devices"),
     "worlds": ("rps_jax.runs.results.PlanRequest", "rps_jax.world.draws", "rps_jax.world.domain"),
     "programs": ("rps_jax.trials.batch._schedule", "rps_jax.lowering"),
-    "run": ("rps_jax.trials.batch.run",),
+    "run": ("rps_jax.trials.batch.run", "rps_jax.trials.pushes"),
     "files": ("rps_jax.record",),
     "figures": ("rps_jax.analysis.report.png", "rps_jax.analysis.report.Picture.png"),
     "report": ("rps_jax.app.cli.running._report",),
@@ -58,8 +58,10 @@ class Stages(SpeedStudy[xr.Dataset]):
     DIMENSION = "command"
     GROWS = ("commands",)
 
-    commands: tuple[str, ...] = tuple(
-        f"sweep --laws rps_tuned --domain wide --worlds {worlds}" for worlds in (1000, 10000)
+    commands: tuple[str, ...] = (
+        "push --object box --target -2 0 --no-video",
+        "sweep --laws rps_tuned --domain wide --worlds 100",
+        "sweep --laws rps_tuned --domain wide --worlds 1000",
     )
     """Arguments of `rps`."""
     limit: float = option(1800.0, 1, 86400)
