@@ -1,5 +1,7 @@
 """The ladder of laws: the same worlds for all laws, their senses, and comparisons."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -58,7 +60,9 @@ def test_the_default_laws_are_all_laws_in_the_order_of_their_senses():
     assert set(ladder.Ladder().chosen) == set(registry.laws_for("omni")) < set(registry.LAWS)
     order = ["touch", "taxels", "ends", "force", "pose"]
     assert list(dict.fromkeys(senses.values())) == order  # from the fewest senses on
-    assert {name for name in senses if senses[name] == "taxels"} == set(policy.SHIPPED)
+    learned = {name for name in senses if senses[name] == "taxels"}
+    # Policies that other tests of this process have read are named by a digest.
+    assert {x for x in learned if not re.search("_[0-9a-f]{8}$", x)} == set(policy.SHIPPED)
     assert [name for name in senses if senses[name] == "force"] == ["force_push_published"]
     assert {name for name in senses if senses[name] == "pose"} == {"aps", "dipole"}
     for params in registry.LAWS.values():
