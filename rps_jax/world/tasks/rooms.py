@@ -108,9 +108,8 @@ class Rooms(Following):
 
     @property
     def shape(self) -> Hashable:
-        """Kind, numbers of routes, vertices and walls, and whether a world has all of these."""
-        near, reach = self._near
-        return self.kind, self._routes.shape, near.shape, reach is None
+        """Kind, numbers of routes and vertices, and of ends of walls, with one more in large maps."""
+        return self.kind, self._routes.shape, min(len(self.walls), 2 * _NEAR + 1)
 
     @property
     def idle(self) -> frozenset[str]:
@@ -137,8 +136,8 @@ class Rooms(Following):
         lines = self._routes[:, :, None]
         away = [distances(x[:-1], x[1:], *pairs.T).min(axis=0) for x in lines]
         order = np.argsort(away, axis=1, kind="stable")
-        others = np.take_along_axis(np.array(away), order[:, _NEAR, None], axis=1)
-        return pairs[order[:, :_NEAR]].reshape(len(order), -1), others[:, 0]
+        reach = np.take_along_axis(np.array(away), order[:, _NEAR, None], axis=1)
+        return pairs[order[:, :_NEAR]].reshape(len(order), -1), reach[:, 0]
 
     def check(self) -> None:
         """Raise InputError for a map without a way from each start to each goal."""
@@ -385,13 +384,13 @@ def _grid(nodes: np.ndarray, a: Any, b: Any, clearance: float) -> tuple[np.ndarr
     points = low + x[:, None] + 1j * y
     # Between two neighbours, a wall may be nearer by the second term.
     free = _away_from_walls(points, a, b, clearance) > clearance + cell**2 / (4 * clearance)
-    numbers = np.where(free, nodes.size + np.cumsum(free).reshape(free.shape) - 1, -1)
+    indices = np.where(free, nodes.size + np.cumsum(free).reshape(free.shape) - 1, -1)
     edges = list[np.ndarray]()
     for first, second in (
-        (numbers[1:], numbers[:-1]),
-        (numbers[:, 1:], numbers[:, :-1]),
-        (numbers[1:, 1:], numbers[:-1, :-1]),
-        (numbers[1:, :-1], numbers[:-1, 1:]),
+        (indices[1:], indices[:-1]),
+        (indices[:, 1:], indices[:, :-1]),
+        (indices[1:, 1:], indices[:-1, :-1]),
+        (indices[1:, :-1], indices[:-1, 1:]),
     ):
         edges.append(np.stack([first, second])[:, (first >= 0) & (second >= 0)])
     inner = points[free]
@@ -400,9 +399,9 @@ def _grid(nodes: np.ndarray, a: Any, b: Any, clearance: float) -> tuple[np.ndarr
         is_clear = distances(node, inner[near, None], a, b).min(axis=1) > clearance - 1e-9
         near = near[is_clear] + nodes.size
         edges.append(np.stack([np.full_like(near, i), near]))
-    every, (first, second) = np.append(nodes, inner), np.concatenate(edges, axis=1)
-    lengths = abs(every[first] - every[second])
-    return every, scipy.sparse.csr_array((lengths, (first, second)), shape=2 * (every.size,))
+    vertices, (first, second) = np.append(nodes, inner), np.concatenate(edges, axis=1)
+    lengths = abs(vertices[first] - vertices[second])
+    return vertices, scipy.sparse.csr_array((lengths, (first, second)), shape=2 * (vertices.size,))
 
 
 def _away_from_walls(points: np.ndarray, a: Any, b: Any, clearance: float) -> np.ndarray:
@@ -420,15 +419,15 @@ def _away_from_walls(points: np.ndarray, a: Any, b: Any, clearance: float) -> np
 
 def _straighten(path: np.ndarray, a: Any, b: Any, clearance: float) -> np.ndarray:
     """Return those points (N,) of a path that straight lines clear of walls join."""
-    kept, i = [0], 0
+    corners, i = [0], 0
     while i < path.size - 1:
         low, high = i + 1, path.size  # the line to the point `low` is clear
         while high - low > 1:
             middle = (low + high) // 2
             is_clear = distances(path[i], path[middle], a, b).min() > clearance - 1e-9
             low, high = (middle, high) if is_clear else (low, middle)
-        kept.append(i := low)
-    return path[kept]
+        corners.append(i := low)
+    return path[corners]
 
 
 TASK = Rooms
