@@ -56,12 +56,12 @@ def main() -> None:
     """Run the command, and sample the thread that runs it."""
     file, *arguments = sys.argv[1:]
     del sys.path[0]  # the folder of this file
-    begun, seconds = time.time(), defaultdict[tuple[str, ...], float](float)
+    start_time, seconds = time.time(), defaultdict[tuple[str, ...], float](float)
 
     def write() -> None:
         """Write the samples."""
         with open(file, "w") as stream:
-            json.dump([begun, time.time(), list(dict(seconds).items())], stream)
+            json.dump([start_time, time.time(), list(dict(seconds).items())], stream)
 
     inputs = threading.get_ident(), seconds, write
     threading.Thread(target=sample, args=inputs, daemon=True).start()

@@ -41,9 +41,9 @@ STAGES = {
     "files": ("rps_jax.record",),
     "figures": ("rps_jax.analysis.report.png", "rps_jax.analysis.report.Picture.png"),
     "report": ("rps_jax.app.cli.running._report",),
-    "other": ("",),
 }
 FIRST, LAST = "start of Python", "end of the process"  # before and after the samples
+OTHER = "other"  # what has no stage
 SAMPLER = Path(__file__).with_name("sampler.py")
 
 
@@ -99,7 +99,7 @@ def divided(command: str, limit: float) -> xr.Dataset:
             printed(words, command, folder, limit)
             ended = time.time()
         first, last, stacks = json.loads(samples.read_text())
-    seconds = dict.fromkeys([FIRST, *STAGES, LAST], 0.0)
+    seconds = dict.fromkeys([FIRST, *STAGES, OTHER, LAST], 0.0)
     seconds |= {FIRST: first - started, LAST: ended - last}
     for names, duration in stacks:
         seconds[stage_of(names)] += duration
@@ -111,6 +111,6 @@ def stage_of(names: Sequence[str]) -> str:
     """Return the stage of the innermost function of a stack that has one; outermost name first."""
     for name in reversed(names):
         for stage, prefixes in STAGES.items():
-            if name.startswith(prefixes) and stage != "other":
+            if name.startswith(prefixes):
                 return stage
-    return "other"
+    return OTHER
