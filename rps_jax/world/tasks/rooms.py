@@ -108,7 +108,7 @@ class Rooms(Following):
 
     @property
     def shape(self) -> Hashable:
-        """Kind, numbers of routes and vertices, and of ends of walls, with one more in large maps."""
+        """Kind, numbers of routes and vertices, and of ends of walls: one more in large maps."""
         return self.kind, self._routes.shape, min(len(self.walls), 2 * _NEAR + 1)
 
     @property
