@@ -21,11 +21,15 @@ from rps_jax.app.cli import flags, names, running
 from rps_jax.control import registry
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.robot.robot import ROBOTS
+from rps_jax.robot.skin import SKINS
 from rps_jax.runs.question import Question
 from rps_jax.runs.sweep import merge
 from rps_jax.trials.results import DIMS
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.world import paper
+from rps_jax.world.domain import DOMAINS
+from rps_jax.world.tasks import TASKS
 
 PAGES = [
     page
@@ -218,6 +222,17 @@ def test_commands_flags_and_defaults_equal_the_record():
 
     recorded = json.loads(command_line.RECORD.read_text())
     assert defaults(command_line.all_flags()) == defaults(recorded)
+
+
+REGISTRIES = {"--task": TASKS, "--robot": ROBOTS, "--domain": DOMAINS, "--skin": SKINS}
+
+
+@pytest.mark.parametrize(("flag", "registry"), REGISTRIES.items())
+def test_help_names_all_that_is_registered(flag, registry):
+    texts = {c: f[flag]["help"] for c, f in command_line.all_flags().items() if flag in f}
+    assert texts
+    for text in texts.values():
+        assert set(registry) <= set(text.partition(" Names: ")[2].rstrip(".").split(", "))
 
 
 IMPORT = """

@@ -108,8 +108,8 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     }
 
     domain: Domains = ("wide",)
-    """Domains to learn in: wide, real, prisms, hostile, or JSON files of ranges; changes follow
-    each, as wide,objects=random_box."""
+    """Domains to learn in: their names, or JSON files of ranges; changes follow each, as
+    wide,objects=random_box."""
     minutes: float = option(10.0, 0, 1e5, unit="min")
     """Wall clock after which the run stops [min], with compilation and validation, summed over all
     processes of the run; 0 means no limit."""
