@@ -19,6 +19,7 @@ from helpers import ROOT, printed, refusal, refusing, rps, setting_of
 import rps_jax
 from rps_jax.app.cli import flags, names, running
 from rps_jax.control import registry
+from rps_jax.control.registry import LAWS
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.robot.robot import ROBOTS
@@ -284,6 +285,28 @@ def test_a_quick_run_keeps_an_explicit_value_that_equals_the_default():
     assert (called.worlds, called.tuned, called.population) == (7, ("logistic",), quick.population)
     assert called.setting.engine == small["setting.engine"]
     assert default.with_quick_values() == default
+
+
+@pytest.mark.parametrize("name", [x for x, law in LAWS.items() if registry.law_of(law).bounds])
+@pytest.mark.parametrize("command", ["tune es", "tune grad"])
+def test_quick_suits_each_law(command, name):
+    law = registry.law_of(LAWS[name])
+    robot = f"ideal,drive={law.drives[0]}" + ",turning_radius=0.5" * (law.drives[0] == "car")
+    words = [
+        "--quick",
+        "--law",
+        name,
+        "--robot",
+        robot,
+        "--task",
+        "pose" if law.heading else "reach",
+    ]
+    question = flags.parse(names.question_type(command), command, words)[0]
+    question.validate()
+    assert (
+        question
+        == type(question)(law=name, robot=robot, task=question.task, quick=True).with_quick_values()
+    )
 
 
 def test_files_of_equal_names_are_distinguished_by_their_folders(tmp_path):

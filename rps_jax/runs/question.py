@@ -238,6 +238,14 @@ def quick_command(command: C) -> C:
     return quick
 
 
+def quick_defaults(command: C) -> C:
+    """Return the defaults of a command, with its quick values."""
+    defaults = type(command)()
+    for name, value in command.quick_values().items():
+        defaults = _replace_field(defaults, name, value)
+    return defaults
+
+
 def _replace_field(record: D, name: str, value: object) -> D:
     """Return a dataclass with another value of a field, or of a field of a field, OWNER.FIELD."""
     owner, _, inner = name.partition(".")

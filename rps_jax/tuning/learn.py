@@ -146,6 +146,9 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         errors.check_each_once("domain", self.domains)
         for domain in self.domains:
             errors.check_name("skin of a domain to learn in", domain.skin, ("capacitive",))
+            if domain.task.HAS_HEADING:
+                rule = "a learned law does not sense the heading of a goal; choose another task"
+                raise errors.not_allowed("task", domain.task.kind, rule)
         self.setting.simulator.check_traced()
         count = self.num_envs * sum(len(domain.objects) for domain in self.domains)
         if self.num_minibatches > count:

@@ -161,9 +161,13 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     # ---------------------------------------------------------------------------------------
 
     def quick_values(self) -> Mapping[str, object]:
-        """Values of `quick`; its choice of parameters is for RPS alone."""
-        is_rps = isinstance(self.params, type(registry.LAWS["rps"]))
-        return {k: v for k, v in self.QUICK.items() if k != "tuned" or is_rps}
+        """Values of `quick`; parameters for RPS alone, an engine for laws that sense no force."""
+        values = dict(self.QUICK)
+        if not isinstance(self.params, type(registry.LAWS["rps"])):
+            del values["tuned"]
+        if registry.law_of(self.params).senses == "force":
+            del values["setting.engine"]
+        return values
 
     def check(self) -> None:
         if not registry.law_of(self.params).bounds:

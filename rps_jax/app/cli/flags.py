@@ -32,7 +32,13 @@ from rps_jax.errors import InputError, check_name, suggest
 from rps_jax.record import options
 from rps_jax.record.options import option
 from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
-from rps_jax.runs.question import Command, Question, SimulationQuestion, current_names
+from rps_jax.runs.question import (
+    Command,
+    Question,
+    SimulationQuestion,
+    current_names,
+    quick_defaults,
+)
 from rps_jax.spec import Spec, named_in, specs_of
 from rps_jax.trials.setting import PhysicsField, Setting
 from rps_jax.trials.trial import Rules
@@ -96,9 +102,7 @@ def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q
     words = [_current_flag(question_type, word) for word in words]
     question, session = _parse(question_type(), command, words)
     if getattr(question, "quick", False):
-        quick = dataclasses.replace(question_type(), quick=True).with_quick_values()
-        defaults = dataclasses.replace(quick, quick=False)
-        question, session = _parse(defaults, command, words)
+        question, session = _parse(quick_defaults(question), command, words)
     options.check_fields(session)
     return question, session
 
