@@ -169,7 +169,8 @@ def test_a_film_shows_mode_and_memory_of_the_law(law, tmp_path):
     (take,) = film.of_sweep(tmp_path, plan, [law], "first", (1, 1))
     shots = [shot for _, (shot,) in islice(film._shots(take, plan.setting, 50), 40)]
     assert np.isnan(shots[0].remembered).all()
-    assert np.linalg.norm(shots[-1].remembered - shots[-1].qpos[3:5]) < 0.2
+    middle, qpos = np.asarray(shots[-1].remembered), np.asarray(shots[-1].qpos)
+    assert np.linalg.norm(middle - qpos[3:5]) < 0.2
     modes = {shot.label.partition(" s")[2] for shot in shots}
     assert modes == {"", ", backing off", ", driving around the object"}
 

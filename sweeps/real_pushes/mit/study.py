@@ -211,8 +211,8 @@ class Mit(QuickStudy[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Fit each cell to 20 % of its pushes, and then to few with the prior of the others."""
         cores = len(os.sched_getaffinity(0))
-        context, cpu = multiprocessing.get_context("spawn"), ("cpu",)
-        processes = ProcessPoolExecutor(cores, context, device.choose, cpu)
+        context, choose = multiprocessing.get_context("spawn"), partial(device.choose, "cpu")
+        processes = ProcessPoolExecutor(cores, context, choose)
         with processes, ThreadPoolExecutor(2 * cores) as threads:
 
             def parts_of(kind: str, compute: Callable[[str], xr.Dataset]) -> list[xr.Dataset]:
