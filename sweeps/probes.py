@@ -127,6 +127,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
         ("arena", "commands*", "compilers*", "costs", "derivatives*", "environments*", "gpus"), ()
     ),
     **dict.fromkeys(("kernel", "levers", "robot", "speed*", "stages", "tasks_cost_*"), ()),
+    "maps": ("corridor",),
 }
 
 

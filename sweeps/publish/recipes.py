@@ -352,6 +352,7 @@ RECIPES: dict[str, Recipe] = {
     "tasks_cost_gpu": recipe(
         f"rps sweeps/corridors/costs.py --worlds 16384 --rounds 6 {_MACHINE}", gpu=2
     ),
+    "maps": recipe(f"rps sweeps/corridors/maps.py --data FOLDER {_MACHINE}", cores=10),
     "force_push_paths": recipe(f"rps sweeps/force_push_grid/paths.py {_MACHINE}", cores=60, gpu=2),
     "tuned_for_corridors": recipe(
         "rps ladder --laws rps_tuned rps_tuned,sweeps/corridors/tuned.json --domain wide real "
