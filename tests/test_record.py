@@ -187,6 +187,25 @@ def test_a_file_without_checksum_is_read(sound, tmp_path):
     reports_corruption(folder / "results.nc")
 
 
+def test_an_archive_names_its_commit(tmp_path):
+    """A machine without git gets the code by `git archive`."""
+    archive, commands = tmp_path / "archive", ("init -q", "add .", "commit -qm x")
+    checkout = tmp_path / "checkout"
+    for folder in (archive, checkout):
+        folder.mkdir()
+    for name in (".gitattributes", ".git_archival.txt"):
+        shutil.copy(ROOT / name, checkout)
+    git = ["git", "-C", str(checkout), "-c", "user.name=a", "-c", "user.email=a@b"]
+    for command in commands:
+        subprocess.run([*git, *command.split()], check=True)
+    tar = subprocess.run([*git, "archive", "HEAD"], check=True, capture_output=True).stdout
+    subprocess.run(["tar", "x", "-C", str(archive)], check=True, input=tar)
+    commit = provenance.commit_of(checkout)
+    assert commit == provenance.commit_of(archive)
+    assert len(commit) == 40
+    assert provenance.commit_of(tmp_path) is None
+
+
 def test_a_part_is_named_by_its_number_and_digest(tmp_path):
     """The name is stable, so that a sweep of another version can be resumed."""
     content = files.encode_results(RESULTS.assign_attrs(part="0000012"))

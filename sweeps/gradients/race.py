@@ -4,7 +4,13 @@ All tunings of a problem run in lockstep: their trials form one batch. Each has 
 with its generations, so a killed race resumes. The generation with the best validation within a
 budget is tested in worlds that no tuning has met.
 
-rps sweeps/gradients/race.py
+    rps sweeps/gradients/race.py
+
+Problems may run side by side, each in a separate run folder, which a last command collects:
+
+    rps sweeps/gradients/race.py --counts 64 --out runs/race_64
+    rps sweeps/gradients/race.py --counts 512 --out runs/race_512
+    rps sweeps/gradients/race.py runs/race_64 runs/race_512 --machine "one GPU"
 """
 
 from __future__ import annotations
@@ -34,7 +40,7 @@ from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.run import Tuning
-from sweeps.study_base import Parts, Study, Table, mean_interval, part_name
+from sweeps.study_base import CollectedStudy, Parts, Table, mean_interval, part_name
 
 FOLDER, DRUMS = "sweeps/gradients", ("random_cylinder",)  # from the root of the repository
 # Options of tunings by the number of tuned parameters: those of RPS or RPS+, or entries of tables.
@@ -42,7 +48,7 @@ COUNTS: dict[int, dict[str, Any]] = {
     6: {"tuned": ("K_h", "K_v", "L", "beta", "l_cr", "d_th")},
     13: {"tuned": ("full",)},
     18: {"law": "rps_plus", "domain": ("hostile",), "robot": "kairos", "objects": ("random_box",)},
-    **{n: {"law": f"{FOLDER}/tables.py:Table{n}", "objects": DRUMS} for n in (64, 512, 2048)},
+    **{n: {"law": f"{FOLDER}/tables.py:Table{n}", "objects": DRUMS} for n in (64, 512, 2048, 4097)},
 }
 SCORES = "success", "score"  # of a trial in a test world
 FIRST = "derivatives"  # method with which the others are compared
@@ -89,7 +95,11 @@ class Lockstep:
         requests = [x for _, tried, _ in waiting for x in tried]
         question, *_ = (question for question, _, _ in waiting)
         try:
-            scores, timing = score_candidates(requests, question.setting, question.objective)
+            # Batches of similar sizes run in one program.
+            options = {"capacity": lambda trials: 1 << (trials - 1).bit_length()}
+            scores, timing = score_candidates(
+                requests, question.setting, question.objective, **options
+            )
             for _, tried, answer in waiting:
                 own, scores = scores[: len(tried)], scores[len(tried) :]
                 time = sum(float(np.sum(x.outcome.time)) for x in own)
@@ -153,7 +163,7 @@ METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
 
 
 @dataclass(frozen=True)
-class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
+class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     """Race derivatives, slopes and evolution: equal simulated time and equal wall time.
 
     The answer has `success` and `score` (count, seed, method, budget, world) of the tuned laws in
@@ -178,9 +188,9 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     methods: tuple[str, ...] = (FIRST, "slopes", "evolution")
     """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials), or evolution."""
-    counts: tuple[int, ...] = (6, 13, 64, 512, 2048)
-    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, or 64, 512 and
-    2048 entries of tables."""
+    counts: tuple[int, ...] = (6, 13, 64, 512, 2048, 4097)
+    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, or 64, 512, 2048
+    and 4097 of laws with tables."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
     simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
@@ -204,9 +214,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def parts(self, run: Run) -> Parts:
         """Return the function that runs and tests the tunings of each count."""
-        return {
-            n: partial(self._compete, run.folder or Path(str(self.out)), n) for n in self.counts
-        }
+        folder = run.folder or Path(str(self.out))
+        return {n: partial(self._compete, folder, n) for n in self.counts if not self.runs}
 
     def tuning(self, seed: int, count: int, method: str) -> Tuning:
         """Return a tuning of the race."""
