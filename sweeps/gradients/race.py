@@ -18,7 +18,7 @@ from __future__ import annotations
 import functools
 import itertools
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -139,22 +139,6 @@ class _ES(_Paced, TuneES):
     pass
 
 
-def timed(limit: float) -> type[Run]:
-    """Return runs that begin no generation after some wall clock [s]."""
-
-    class Timed(Run):
-        """Run with a limit."""
-
-        def steps(self, compute: Any, proceed: Any, **options: Any) -> Iterator[xr.Dataset]:
-            spent = 0.0
-            steps = super().steps(compute, lambda i: proceed(i) and spent < limit, **options)
-            for results in steps:
-                spent += float(results.run)
-                yield results
-
-    return Timed
-
-
 METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
     "derivatives": (PacedGrad, {"steps": 16}),
     "slopes": (_ES, {"estimator": "antithetic", "worlds": 128, "generations": 10}),
@@ -223,7 +207,8 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
         setting, budget = replace(self.setting, seed=seed), max(self.simulated, default=0.0)
         diagonal = {"estimator": "sep_cma"} if method == "evolution" and count >= _LARGE else {}
         sizes = _QUICK if self.quick else {}
-        limits = {"validation": 64, "budget": budget}
+        minutes = 0.0 if self.simulated else max(self.wall) / 60
+        limits = {"validation": 64, "budget": budget, "minutes": minutes}
         return kind(**{**COUNTS[count], **limits, **options, **diagonal, **sizes}, setting=setting)
 
     def _compete(self, folder: Path, count: int) -> xr.Dataset:
@@ -232,13 +217,12 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
         folders = [folder / part_name(*label) for label in labels]
         questions = [self.tuning(*label) for label in labels]
         pool = Lockstep(len(labels))
-        limited = timed(np.inf if self.simulated else max(self.wall))
 
         def run(question: Tuning, at: Path) -> pd.DataFrame:
             at.mkdir(exist_ok=True)
             try:
                 object.__setattr__(question, "pool", pool)
-                question.answer(limited(at, no_progress))
+                question.answer(Run(at, no_progress))
                 return pd.read_csv(at / "curve.csv")
             finally:
                 pool.leave()

@@ -5,7 +5,10 @@ rps tune grad --law sweeps/learned/weights.py:Weights --tuned weights
 
 from __future__ import annotations
 
+import json
+import sys
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -44,3 +47,18 @@ LAW = Law(
 )
 zeros = {name: np.zeros(x.shape) for name, x in POLICY.weights.items()}
 register_law("learned_weights", LAW, Weights(zeros))
+
+
+def tuned_policy(values: dict[str, Any]) -> policy.Policy:
+    """Return the law with the changes of `tuned.json`."""
+    weights = {
+        name: np.float32(x + np.asarray(values[f"weights.{name}"]))
+        for name, x in POLICY.weights.items()
+    }
+    return POLICY._replace(weights=weights)
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    values = json.loads((folder / "tuned.json").read_text())
+    (folder / "policy.npz").write_bytes(policy.encode(tuned_policy(values)))
