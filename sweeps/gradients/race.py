@@ -269,7 +269,8 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the success of the tunings."""
-        picture = Picture(self.file.removeprefix("gradients_"), partial(draw, results))
+        rows = table(results)
+        picture = Picture(self.file.removeprefix("gradients_"), partial(draw, rows))
         several = results.sizes["count"] > 1
         columns = [
             {"name": "parameters", "merge": True},
@@ -292,7 +293,7 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
         ]
         text = "Square brackets: 95 % intervals over the seeds, by Student's t."
         named = {"name": self.file, "title": "Success", "picture": picture if several else None}
-        return [Table(table(results), text, columns, **named)]
+        return [Table(rows, text, columns, **named)]
 
 
 race = call_of(Race)
@@ -370,17 +371,16 @@ def table(results: xr.Dataset) -> list[list[Any]]:
     return rows
 
 
-def draw(results: xr.Dataset) -> Figure:
+def draw(rows: Sequence[Sequence[Any]]) -> Figure:
     """Return the success against the number of parameters, with a panel for each budget."""
-    sheet, axes = tiles(
-        results.sizes["budget"], 2, (3.5, 2.2), (0.0, 0.0), sharex=True, sharey=True
-    )
-    counts, means = results["count"].values, 100 * results.success.mean("world")
-    for ax, budget in zip(axes.ravel(), results.budget.values, strict=False):
-        ax.plot(counts, 100 * results.start_success.mean("world"), "k:", label="start")
-        for at, method in enumerate(results.method.values):
-            values = means.sel({"budget": budget, "method": method})
-            mean, *limits = np.transpose([mean_interval(x) for x in values.values])
+    budgets = list(dict.fromkeys(row[1] for row in rows if row[1]))
+    sheet, axes = tiles(len(budgets), 2, (3.5, 2.2), (0.0, 0.0), sharex=True, sharey=True)
+    starts = [(int(row[0]), row[3]) for row in rows if not row[1]]
+    for ax, budget in zip(axes.ravel(), budgets, strict=False):
+        ax.plot(*np.transpose(starts), "k:", label="start")
+        for at, method in enumerate(dict.fromkeys(row[2] for row in rows if row[1])):
+            cells = [(int(row[0]), *row[3]) for row in rows if [*row[1:3]] == [budget, method]]
+            counts, mean, *limits = np.transpose(cells)
             error = np.abs(np.array(limits) - mean) if limits else None
             marks = {"marker": "o", "markersize": 3, "capsize": 2}
             ax.errorbar(counts * 1.08**at, mean, error, label=method, **marks)
