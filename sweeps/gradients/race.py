@@ -240,17 +240,8 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
         robot = COUNTS[count].get("robot")
         scores = evaluate([start, *chosen], domain, self.worlds, robot=robot, **options)
         dims, shape = ("seed", "method"), (len(self.seeds), len(self.methods))
-        by_tuning = {
-            "generations": [len(curve) for curve in curves],
-            "windows": [
-                np.sum(curve["windows"].to_numpy()) if "windows" in curve else 0.0
-                for curve in curves
-            ],
-            **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
-        }
-        variables: dict[str, Any] = {
-            name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()
-        }
+        generations = np.reshape([len(curve) for curve in curves], shape)
+        variables: dict[str, Any] = {"generations": (dims, generations)}
         for name in SCORES:
             first, *tuned = scores[name].values.astype(np.float32)
             by_budget = np.array(tuned)[inverse.ravel()].reshape(*shape, len(budgets), -1)
