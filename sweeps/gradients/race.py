@@ -379,5 +379,6 @@ def draw(rows: Sequence[Sequence[Any]]) -> Figure:
             xscale="log", xlabel="tuned parameters", ylabel="success [%]", title=f"equal {budget}"
         )
         ax.grid(alpha=0.3)
-    axes[0, 0].legend()
+    handles = axes[0, 0].get_legend_handles_labels()
+    sheet.legend(*handles, loc="outside lower center", ncols=4)
     return sheet
