@@ -115,6 +115,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "landscape": ("wide", "hostile", "tune_es"),
     **dict.fromkeys(("learned_test", "learned_failures", "sb3"), ("hostile", "learn")),
     **dict.fromkeys(("learned_variants", "learned_continued"), ("hostile", "learn")),
+    "learned_windows": ("hostile", "learn", "tune_grad"),
     "mends": ("wide", "hostile", "tune_es"),
     **dict.fromkeys(("limits", "sizes"), ("wide", "hostile")),
     **dict.fromkeys(("plans", "replans"), ("quasistatic",)),

@@ -106,6 +106,16 @@ _PLUS_TABLES = ("Plus64", "Plus2048")
 _HOSTILE = (
     "--windows 512 --trials 128 --validation 512 --checks 128 --worlds 256 --steps 12 --horizon 200"
 )
+_WINDOWS = (
+    "rps learn --initial learned --action-std 0.2 --learning-rate 2e-4 --domain wide hostile "
+    "--num-envs 1024 --drawn 8192 --validation 128 --every 1.5 --horizon 300 --max-lost 150 "
+    "--prioritised 0.5 --success 2 --failure 1 --anneal 0.4 --ema-updates 100 --minutes 4.5 "
+    "--out runs/ppo",
+    "rps tune grad --law sweeps/learned/weights.py:Weights --domain wide hostile --windows 512 "
+    "--trials 64 --validation 128 --checks 256 --worlds 256 --steps 60 --window-steps 60 "
+    "--refresh 10 --learning-rate 0.01 --sigma 0.02 --horizon 100 --fidelity fast --minutes 3.5 "
+    "--out runs/windows",
+)
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 
@@ -404,6 +414,13 @@ RECIPES: dict[str, Recipe] = {
         f"rps sweeps/export --tables trials paper worlds bags odd {_MACHINE}",
         f"rps sweeps/export --tables inputs {_MACHINE}",
         cores=60,
+    ),
+    "learned_windows": recipe(
+        *_WINDOWS,
+        "rps ladder --domain wide hostile --worlds 10000 --seed 69 --laws learned "
+        "runs/ppo/policy.npz sweeps/learned/weights.py:Weights,runs/windows/tuned.json",
+        gpu=15,
+        section=rows.comparison,
     ),
     "sb3": recipe(f"rps sweeps/learned/sb3.py {_MACHINE}", cores=3),
     "learned_test": recipe(
