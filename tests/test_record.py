@@ -187,25 +187,6 @@ def test_a_file_without_checksum_is_read(sound, tmp_path):
     reports_corruption(folder / "results.nc")
 
 
-def test_an_archive_names_its_commit(tmp_path):
-    """A machine without git gets the code by `git archive`."""
-    archive, commands = tmp_path / "archive", ("init -q", "add .", "commit -qm x")
-    checkout = tmp_path / "checkout"
-    for folder in (archive, checkout):
-        folder.mkdir()
-    for name in (".gitattributes", ".git_archival.txt"):
-        shutil.copy(ROOT / name, checkout)
-    git = ["git", "-C", str(checkout), "-c", "user.name=a", "-c", "user.email=a@b"]
-    for command in commands:
-        subprocess.run([*git, *command.split()], check=True)
-    tar = subprocess.run([*git, "archive", "HEAD"], check=True, capture_output=True).stdout
-    subprocess.run(["tar", "x", "-C", str(archive)], check=True, input=tar)
-    commit = provenance.commit_of(checkout)
-    assert commit == provenance.commit_of(archive)
-    assert len(commit) == 40
-    assert provenance.commit_of(tmp_path) is None
-
-
 def test_a_part_is_named_by_its_number_and_digest(tmp_path):
     """The name is stable, so that a sweep of another version can be resumed."""
     content = files.encode_results(RESULTS.assign_attrs(part="0000012"))
@@ -383,6 +364,16 @@ def test_an_editable_install_records_the_version_of_its_code(monkeypatch):
     monkeypatch.setattr(provenance.metadata, "version", lambda name: "0.0.1")
     versions = provenance.collect_environment()["packages"]
     assert (versions["rps_jax"], versions["jax"]) == (rps_jax.__version__, "0.0.1")
+
+
+@pytest.mark.parametrize(("content", "commit"), [("node: abc\n", "abc"), (None, None)])
+def test_an_archive_of_the_repository_knows_its_commit(content, commit, tmp_path, monkeypatch):
+    """Git replaces the format of the file in an archive."""
+    assert ".git_archival.txt export-subst" in (ROOT / ".gitattributes").read_text()
+    content = content or (ROOT / ".git_archival.txt").read_text()
+    (tmp_path / ".git_archival.txt").write_text(content)
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "rps_jax/record/provenance.py"))
+    assert provenance.git_commit.__wrapped__() == commit
 
 
 def test_paths_that_are_not_utf8_keep_their_bytes(tmp_path):

@@ -109,18 +109,18 @@ def package_version(folder: Path) -> str:
 
 @functools.cache
 def git_commit() -> str | None:
-    """Return the git commit of this code, marked if changed; None outside of a checkout."""
-    return commit_of(Path(__file__).resolve().parents[2])
+    """Return the git commit of this code, in a checkout marked if changed; None if unknown.
 
-
-def commit_of(root: Path) -> str | None:
-    """Return the git commit of a checkout, marked if changed, or of a folder of `git archive`."""
+    In an archive of the repository, git has written it to `.git_archival.txt`.
+    """
+    root = Path(__file__).resolve().parents[2]
     words = ("describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=-changed")
     command = ["git", "-C", str(root), *words]
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         if (root / ".git").exists():
             output = subprocess.check_output(command, stderr=subprocess.DEVNULL, timeout=10)
             return output.decode().strip()
-        archived = (root / ".git_archival.txt").read_text(encoding="utf-8").strip()
-        return archived.removeprefix("node: ")
+    with contextlib.suppress(OSError):
+        commit = (root / ".git_archival.txt").read_text().partition("node: ")[2].strip()
+        return None if "$" in commit else commit
     return None
