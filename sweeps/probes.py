@@ -105,7 +105,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "sensitivity": ("sensitivity", "hostile", "real"),
     "fit_*": ("push_fused", "wide", "tune_es"),
     "real_pushes_*": ("real_pushes",),
-    "gradients_*": ("tune_grad", "learn"),
+    **dict.fromkeys(("gradients_*", "learned_windows"), ("tune_grad", "learn")),
     **dict.fromkeys(("ground", "straight"), ("push_mujoco", "push_fused")),
     "support*": ("wide", "hardware"),
     "mit*": ("real_pushes",),

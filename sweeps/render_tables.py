@@ -73,6 +73,7 @@ STALE: dict[str, str] = {
             "gradients_direction",
             "gradients_race",
             "gradients_race_18",
+            "gradients_race_wall",
             "gradients_stiff",
         ),
         "a sum in the solver got its former order back, with other last bits",

@@ -27,7 +27,7 @@ import numpy as np
 import scipy.special
 import xarray as xr
 
-from rps_jax import InputError, Setting, errors
+from rps_jax import InputError, Setting, errors, load
 from rps_jax.laws import resolve_law
 from rps_jax.questions import Picture, Plan, Run, Section
 from rps_jax.record import options, provenance
@@ -143,12 +143,16 @@ class Study(Question[T]):
 
     def publish(self, results: Any, run_folder: Path) -> None:
         """Write the data files and the pictures of the tables that have a name."""
-        runs = [provenance.read_environment(run_folder)]
+        runs = self.records(run_folder)
         for table in filter(lambda table: table.name, self.report_tables(results)):
             path = self.folder / self.RESULTS / f"{table.name}.json"
             write_table(path, runs, self.machine, table)
             if table.picture:
                 (self.folder / f"{table.picture.name}.png").write_bytes(table.picture.png())
+
+    def records(self, run_folder: Path) -> list[Mapping[str, Any]]:
+        """Return the provenance of the runs behind the tables."""
+        return [provenance.read_environment(run_folder)]
 
     # --- as questions ----------------------------------------------------------------------
 
@@ -191,6 +195,25 @@ class Study(Question[T]):
         if self.machine and self.out is not None:
             self.publish(results, Path(self.out))
         return results
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectedStudy(Study[xr.Dataset]):
+    """Base class of studies whose parts may run apart, each in a separate run folder."""
+
+    runs: tuple[str, ...] = options.option((), positional=True)
+    """Run folders of this study, to collect their results."""
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Compute the missing parts, or collect the results of other run folders."""
+        if not self.runs:
+            return super().answer(run)
+        return xr.concat([load(x) for x in self.runs], self.DIMENSION)
+
+    def records(self, run_folder: Path) -> list[Mapping[str, Any]]:
+        """Return the provenance of the runs behind the tables."""
+        folders = map(Path, self.runs) if self.runs else [run_folder]
+        return [provenance.read_environment(folder) for folder in folders]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,6 +3,7 @@
 import json
 import shutil
 import textwrap
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +53,13 @@ def write_law(folder, line="v_y = 0.0", before=""):
     path = folder / "mine.py"
     path.write_text(HEAD + before + body + TAIL)
     return path
+
+
+def test_threads_read_the_file_of_a_law_once(tmp_path):
+    path = write_law(tmp_path, before="\nimport time\ntime.sleep(0.05)\n")
+    with ThreadPoolExecutor(4) as pool:
+        laws = list(pool.map(registry.resolve_law, [f"{path}:MineParams"] * 4))
+    assert len({type(params) for _, params in laws}) == 1
 
 
 # --- twists that are not finite ------------------------------------------------------------

@@ -329,6 +329,20 @@ def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, options, monkeypatc
     assert "while" not in primitives
 
 
+def test_the_physics_of_a_learned_law_is_differentiated_natively(monkeypatch):
+    """XLA compiles the law alone: it would take very long for a whole control step."""
+    monkeypatch.setattr(native, "load", lambda name: True)  # no compiler runs
+    stage, (worlds, params), loop = batch("box", count=2, law="learned_small")
+    trials = start_trials((worlds, params), loop)
+
+    def path_length(params):
+        run = stage, worlds, params, trials, loop, 2, native.mapped
+        return jnp.sum(trial.unroll(*run)[0].path_length)
+
+    program = jax.make_jaxpr(jax.grad(path_length))(params)
+    assert "rps_native" in str(program)
+
+
 UNSUPPORTED = (
     "operation `lgamma` cannot be translated; use arithmetic, comparisons, jnp.where and "
     "elementary functions. XLA compiles this law, which is some ten times slower."

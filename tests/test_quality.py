@@ -2,9 +2,12 @@
 
 import numpy as np
 import pandas as pd
+import pytest
 import xarray as xr
+from helpers import observation
 from numpy.testing import assert_allclose
 
+from rps_jax.laws import law_of, resolve_law
 from sweeps.gradients import race
 
 
@@ -38,3 +41,17 @@ def test_the_table_has_intervals_over_the_seeds():
     assert_allclose(first[3], [87.5, 87.5 - half, 87.5 + half], rtol=1e-4)
     assert first[5:] == [0.125, None, "75.0, 100.0", "6"]
     assert_allclose(second[4:7:2], [[25.0] * 3, [0.25] * 3])
+
+
+@pytest.mark.parametrize(("name", "law"), [("Tuned64", "rps_tuned"), ("Plus64", "rps_plus")])
+def test_a_constant_table_multiplies_the_parameters(name, law):
+    table, params = (resolve_law(x)[1] for x in (f"sweeps/gradients/tables.py:{name}", law))
+    rps = getattr(params, "law", params)
+    changed = rps._replace(eta=2 * rps.eta, K_h=0.5 * rps.K_h)
+    expected = params._replace(law=changed) if rps is not params else changed
+    table = table._replace(eta=table.eta + np.log(2.0), K_h=table.K_h - np.log(2.0))
+    obs, twists = observation((0.5, 0.1), 0.4, (0.36, 0.12), True, (2.0, 1.0)), []
+    for law_params in (table, expected):
+        functions = law_of(law_params)
+        twists.append(functions.step(law_params, functions.init(law_params), obs)[1])
+    assert_allclose(*twists, rtol=1e-5)

@@ -376,9 +376,10 @@ def test_the_curve_is_a_table_that_grows_with_the_run(tmp_path, pretended):
         assert_allclose(results.tuned, best, rtol=1e-5)
 
 
-def test_a_search_ends_with_its_budget_and_resumes_with_more(tmp_path, pretended):
-    for budget, done in ((2.5, 3), (4.0, 4), (0.0, 6)):  # 1 s a generation
-        tuned(tmp_path, evolution(budget=budget))
+@pytest.mark.parametrize(("limit", "second"), [("budget", 1.0), ("minutes", 1 / 60)])
+def test_a_search_ends_with_its_budget_and_resumes_with_more(tmp_path, pretended, limit, second):
+    for seconds, done in ((2.5, 3), (4.0, 4), (0.0, 6)):  # 1 s a generation
+        tuned(tmp_path, evolution(**{limit: seconds * second}))
         assert len(read_curve(tmp_path)) == done
 
 

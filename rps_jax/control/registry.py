@@ -9,6 +9,7 @@ import functools
 import importlib
 import pkgutil
 import sys
+import threading
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -58,6 +59,7 @@ LawsLike = Annotated[str | Any | Sequence[Any] | Mapping[str, Any], STORED_LAWS,
 LAWS: dict[str, LawParams] = {}  # parameters of all offered laws, by name
 _HIDDEN: dict[str, LawParams] = {}  # of laws that are not offered: names with an underscore
 _LAWS_BY_CLASS: dict[type, Law] = {}  # by class of parameters
+_FILES = threading.RLock()  # a thread reads the file of a law, and others wait
 _SOURCES: dict[type, dict[str, str]] = {}  # file and digest, by class of parameters
 
 
@@ -291,9 +293,10 @@ def _parse_head(text: str) -> tuple[str, LawParams]:
     path, _, kind = (text, "", "") if _is_python(text) else text.rpartition(":")
     if not _is_python(path):
         return text, LAWS[errors.check_name("law", text, LAWS, "FILE.py or policy.npz")]
-    # The file is run again if another law has taken its name since.
-    if (law := _find_registered(sources.load(Path(path)), kind)) is None:
-        law = _find_registered(sources.load(Path(path), again=True), kind)
+    with _FILES:
+        # The file is run again if another law has taken its name since.
+        if (law := _find_registered(sources.load(Path(path)), kind)) is None:
+            law = _find_registered(sources.load(Path(path), again=True), kind)
     if law is None:
         needed = f"the class {kind}" if kind else "one class of parameters (or use FILE.py:CLASS)"
         rule = f"{path} must define {needed} and call rps_jax.register_law with an instance of it"

@@ -115,6 +115,7 @@ def batched(
     function: Function,
     fallback: Function,
     residuals: Literal["none", "derivatives", "always"] = "none",
+    strict: bool = False,
 ) -> Function:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
 
@@ -127,6 +128,7 @@ def batched(
         and returns results and residuals: numbers that it computes if it gets (), and from which,
         as constants, its derivatives are faster. With `derivatives` it gets None where it is not
         differentiated; with `always` it gets () there, too, so that no other function is compiled.
+      strict: raise TooLargeError where XLA would compile, instead of calling `fallback`.
     """
     if not is_available():
         return fallback
@@ -141,8 +143,10 @@ def batched(
     def plain(*arguments: Pytree) -> Pytree:
         return evaluate(arguments, None)[0]
 
-    run_plain = concurrent([plain], lambda arguments: [fallback(*arguments)])
-    run = concurrent([with_residuals], lambda arguments: [jax.vmap(with_residuals)(*arguments)])
+    run_plain = concurrent([plain], lambda arguments: [fallback(*arguments)], strict=strict)
+    run = concurrent(
+        [with_residuals], lambda arguments: [jax.vmap(with_residuals)(*arguments)], strict=strict
+    )
 
     @jax.custom_jvp
     def call(*arguments: Pytree) -> Pytree:
@@ -218,6 +222,9 @@ def scan(
       state: first state.
       constants: pytree of arrays that do not change.
       length: number of steps.
+
+    Raises:
+      TooLargeError: the step is not compiled here.
     """
     leaves, tree = jax.tree.flatten((state, constants))
     count = len(jax.tree.leaves(state))
@@ -247,7 +254,8 @@ def scan(
 
         arrays = jax.vmap(lambda x: packed(x, indices))(values)
         residuals = "derivatives" if varied is None else "always"
-        call = batched(packed_step, jax.vmap(lambda *x: packed_step(x, None)[0]), residuals)
+        single = jax.vmap(lambda *x: packed_step(x, None)[0])
+        call = batched(packed_step, single, residuals, strict=True)
         end, outputs = jax.lax.scan(
             lambda x, _: call(x, arrays[carried:]), arrays[:carried], length=length
         )
@@ -306,6 +314,7 @@ def concurrent(
     functions: Sequence[Function],
     fallback: Callable[..., Sequence[Pytree]],
     sort_by: Callable[..., jax.Array] | None = None,
+    strict: bool = False,
 ) -> Callable[..., Pytree]:
     """Return functions of batches of worlds as one function; a GPU runs them at the same time.
 
@@ -315,6 +324,7 @@ def concurrent(
         `functions` are not compiled.
       sort_by: returns keys (B,) of a batch's worlds. Worlds with similar keys are computed side by
         side, which changes only how long it takes.
+      strict: raise TooLargeError instead of calling `fallback`.
     """
     if not is_available():
         return fallback
@@ -333,6 +343,8 @@ def concurrent(
         types = tuple((tree, tuple((x.shape, x.dtype) for x in leaves)) for leaves, tree in flat)
         calls, groups = compiled(types)
         if any(library is None for _, library in groups):
+            if strict:
+                raise TooLargeError("XLA compiles this function to faster code.")
             return list(fallback(*arguments))
         inputs = [leaves for leaves, _ in flat]
         if sort_by is not None:

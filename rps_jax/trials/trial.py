@@ -513,7 +513,8 @@ def unroll(
 
     if mapped is native.mapped and native.compiles(stage):
         rules = jax.tree.map(lambda x: jnp.broadcast_to(x, trials.done.shape), loop.rules)
-        return native.scan(single, trials, (worlds, params, rules), steps)
+        with contextlib.suppress(native.TooLargeError):  # of laws with large networks
+            return native.scan(single, trials, (worlds, params, rules), steps)
 
     # Without a checkpoint, XLA would store all intermediate numbers.
     @partial(jax.checkpoint, prevent_cse=False)

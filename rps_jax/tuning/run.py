@@ -70,7 +70,7 @@ Search = Generator[Proposal, Mapping[str, np.ndarray], None]
 class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     """Base of the questions for better parameters of a law."""
 
-    IGNORED_FIELDS = ("budget", "generations", "task")
+    IGNORED_FIELDS = ("budget", "minutes", "generations", "task")
     REPORTS_TIMES = True
     QUICK: ClassVar = {
         # The few parameters that matter most, since few trials cannot determine more; cylinders on
@@ -101,6 +101,8 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     objective: Objective = Objective()
     budget: float = option(0.0, 0, unit="s")
     """Simulated time after which no generation starts [s]; 0 means no limit."""
+    minutes: float = option(0.0, 0, unit="min")
+    """Wall clock without compilation after which no generation starts [min]; 0 means no limit."""
 
     @property
     def title(self) -> str:
@@ -207,13 +209,14 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         """
         search = self.search()
         proposal, best, least = next(search), self.base, np.inf  # `best` has the least validation
-        log, count, simulated = xr.Dataset(), 0, 0.0
+        log, count, simulated, wall = xr.Dataset(), 0, 0.0, 0.0
 
         def report(progress: Progress) -> None:
             run.callback(replace(progress, simulated=simulated + progress.simulated, rounds=count))
 
         def proceed(generation: int) -> bool:
-            return generation < self.num_generations and not 0 < self.budget <= simulated
+            spent = 0 < self.budget <= simulated or 0 < 60 * self.minutes <= wall
+            return generation < self.num_generations and not spent
 
         def compute(generation: int) -> xr.Dataset:
             if generation:
@@ -234,6 +237,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             row = row.expand_dims(generation=[count])
             log = xr.concat([log, row], "generation") if count else row
             count, simulated = count + 1, simulated + float(results.simulated)
+            wall += float(results.run)
             report(Progress(0, 0.0))
             proposal = search.send({str(name): x.values for name, x in results.items()})
         results = self._write(run.folder, best, log)

@@ -4,7 +4,13 @@ All tunings of a problem run in lockstep: their trials form one batch. Each has 
 with its generations, so a killed race resumes. The generation with the best validation within a
 budget is tested in worlds that no tuning has met.
 
-rps sweeps/gradients/race.py
+    rps sweeps/gradients/race.py
+
+Problems may run side by side, each in a separate run folder, which a last command collects:
+
+    rps sweeps/gradients/race.py --counts 64 --out runs/race_64
+    rps sweeps/gradients/race.py --counts 512 --out runs/race_512
+    rps sweeps/gradients/race.py runs/race_64 runs/race_512 --machine "one GPU"
 """
 
 from __future__ import annotations
@@ -12,7 +18,7 @@ from __future__ import annotations
 import functools
 import itertools
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -34,7 +40,7 @@ from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.run import Tuning
-from sweeps.study_base import Parts, Study, Table, mean_interval, part_name
+from sweeps.study_base import CollectedStudy, Parts, Table, mean_interval, part_name
 
 FOLDER, DRUMS = "sweeps/gradients", ("random_cylinder",)  # from the root of the repository
 # Options of tunings by the number of tuned parameters: those of RPS or RPS+, or entries of tables.
@@ -42,7 +48,7 @@ COUNTS: dict[int, dict[str, Any]] = {
     6: {"tuned": ("K_h", "K_v", "L", "beta", "l_cr", "d_th")},
     13: {"tuned": ("full",)},
     18: {"law": "rps_plus", "domain": ("hostile",), "robot": "kairos", "objects": ("random_box",)},
-    **{n: {"law": f"{FOLDER}/tables.py:Table{n}", "objects": DRUMS} for n in (64, 512, 2048)},
+    **{n: {"law": f"{FOLDER}/tables.py:Table{n}", "objects": DRUMS} for n in (64, 512, 2048, 4097)},
 }
 SCORES = "success", "score"  # of a trial in a test world
 FIRST = "derivatives"  # method with which the others are compared
@@ -89,7 +95,11 @@ class Lockstep:
         requests = [x for _, tried, _ in waiting for x in tried]
         question, *_ = (question for question, _, _ in waiting)
         try:
-            scores, timing = score_candidates(requests, question.setting, question.objective)
+            # Batches of similar sizes run in one program.
+            options = {"capacity": lambda trials: 1 << (trials - 1).bit_length()}
+            scores, timing = score_candidates(
+                requests, question.setting, question.objective, **options
+            )
             for _, tried, answer in waiting:
                 own, scores = scores[: len(tried)], scores[len(tried) :]
                 time = sum(float(np.sum(x.outcome.time)) for x in own)
@@ -129,22 +139,6 @@ class _ES(_Paced, TuneES):
     pass
 
 
-def timed(limit: float) -> type[Run]:
-    """Return runs that begin no generation after some wall clock [s]."""
-
-    class Timed(Run):
-        """Run with a limit."""
-
-        def steps(self, compute: Any, proceed: Any, **options: Any) -> Iterator[xr.Dataset]:
-            spent = 0.0
-            steps = super().steps(compute, lambda i: proceed(i) and spent < limit, **options)
-            for results in steps:
-                spent += float(results.run)
-                yield results
-
-    return Timed
-
-
 METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
     "derivatives": (PacedGrad, {"steps": 16}),
     "slopes": (_ES, {"estimator": "antithetic", "worlds": 128, "generations": 10}),
@@ -153,7 +147,7 @@ METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
 
 
 @dataclass(frozen=True)
-class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
+class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     """Race derivatives, slopes and evolution: equal simulated time and equal wall time.
 
     The answer has `success` and `score` (count, seed, method, budget, world) of the tuned laws in
@@ -178,9 +172,9 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     methods: tuple[str, ...] = (FIRST, "slopes", "evolution")
     """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials), or evolution."""
-    counts: tuple[int, ...] = (6, 13, 64, 512, 2048)
-    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, or 64, 512 and
-    2048 entries of tables."""
+    counts: tuple[int, ...] = (6, 13, 64, 512, 2048, 4097)
+    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, or 64, 512, 2048
+    and 4097 of laws with tables."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
     simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
@@ -204,9 +198,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def parts(self, run: Run) -> Parts:
         """Return the function that runs and tests the tunings of each count."""
-        return {
-            n: partial(self._compete, run.folder or Path(str(self.out)), n) for n in self.counts
-        }
+        folder = run.folder or Path(str(self.out))
+        return {n: partial(self._compete, folder, n) for n in self.counts if not self.runs}
 
     def tuning(self, seed: int, count: int, method: str) -> Tuning:
         """Return a tuning of the race."""
@@ -214,7 +207,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         setting, budget = replace(self.setting, seed=seed), max(self.simulated, default=0.0)
         diagonal = {"estimator": "sep_cma"} if method == "evolution" and count >= _LARGE else {}
         sizes = _QUICK if self.quick else {}
-        limits = {"validation": 64, "budget": budget}
+        minutes = 0.0 if self.simulated else max(self.wall) / 60
+        limits = {"validation": 64, "budget": budget, "minutes": minutes}
         return kind(**{**COUNTS[count], **limits, **options, **diagonal, **sizes}, setting=setting)
 
     def _compete(self, folder: Path, count: int) -> xr.Dataset:
@@ -223,13 +217,12 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         folders = [folder / part_name(*label) for label in labels]
         questions = [self.tuning(*label) for label in labels]
         pool = Lockstep(len(labels))
-        limited = timed(np.inf if self.simulated else max(self.wall))
 
         def run(question: Tuning, at: Path) -> pd.DataFrame:
             at.mkdir(exist_ok=True)
             try:
                 object.__setattr__(question, "pool", pool)
-                question.answer(limited(at, no_progress))
+                question.answer(Run(at, no_progress))
                 return pd.read_csv(at / "curve.csv")
             finally:
                 pool.leave()
@@ -247,17 +240,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         robot = COUNTS[count].get("robot")
         scores = evaluate([start, *chosen], domain, self.worlds, robot=robot, **options)
         dims, shape = ("seed", "method"), (len(self.seeds), len(self.methods))
-        by_tuning = {
-            "generations": [len(curve) for curve in curves],
-            "windows": [
-                np.sum(curve["windows"].to_numpy()) if "windows" in curve else 0.0
-                for curve in curves
-            ],
-            **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
-        }
-        variables: dict[str, Any] = {
-            name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()
-        }
+        generations = np.reshape([len(curve) for curve in curves], shape)
+        variables: dict[str, Any] = {"generations": (dims, generations)}
         for name in SCORES:
             first, *tuned = scores[name].values.astype(np.float32)
             by_budget = np.array(tuned)[inverse.ravel()].reshape(*shape, len(budgets), -1)
@@ -276,7 +260,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the success of the tunings."""
-        picture = Picture(self.file.removeprefix("gradients_"), partial(draw, results))
+        rows = table(results)
+        picture = Picture(self.file.removeprefix("gradients_"), partial(draw, rows))
         several = results.sizes["count"] > 1
         columns = [
             {"name": "parameters", "merge": True},
@@ -299,7 +284,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         ]
         text = "Square brackets: 95 % intervals over the seeds, by Student's t."
         named = {"name": self.file, "title": "Success", "picture": picture if several else None}
-        return [Table(table(results), text, columns, **named)]
+        return [Table(rows, text, columns, **named)]
 
 
 race = call_of(Race)
@@ -377,17 +362,16 @@ def table(results: xr.Dataset) -> list[list[Any]]:
     return rows
 
 
-def draw(results: xr.Dataset) -> Figure:
+def draw(rows: Sequence[Sequence[Any]]) -> Figure:
     """Return the success against the number of parameters, with a panel for each budget."""
-    sheet, axes = tiles(
-        results.sizes["budget"], 2, (3.5, 2.2), (0.0, 0.0), sharex=True, sharey=True
-    )
-    counts, means = results["count"].values, 100 * results.success.mean("world")
-    for ax, budget in zip(axes.ravel(), results.budget.values, strict=False):
-        ax.plot(counts, 100 * results.start_success.mean("world"), "k:", label="start")
-        for at, method in enumerate(results.method.values):
-            values = means.sel({"budget": budget, "method": method})
-            mean, *limits = np.transpose([mean_interval(x) for x in values.values])
+    budgets = list(dict.fromkeys(row[1] for row in rows if row[1]))
+    sheet, axes = tiles(len(budgets), 2, (3.5, 2.2), (0.0, 0.0), sharex=True, sharey=True)
+    starts = [(int(row[0]), row[3]) for row in rows if not row[1]]
+    for ax, budget in zip(axes.ravel(), budgets, strict=False):
+        ax.plot(*np.transpose(starts), "k:", label="start")
+        for at, method in enumerate(dict.fromkeys(row[2] for row in rows if row[1])):
+            cells = [(int(row[0]), *row[3]) for row in rows if [*row[1:3]] == [budget, method]]
+            counts, mean, *limits = np.transpose(cells)
             error = np.abs(np.array(limits) - mean) if limits else None
             marks = {"marker": "o", "markersize": 3, "capsize": 2}
             ax.errorbar(counts * 1.08**at, mean, error, label=method, **marks)
@@ -395,5 +379,6 @@ def draw(results: xr.Dataset) -> Figure:
             xscale="log", xlabel="tuned parameters", ylabel="success [%]", title=f"equal {budget}"
         )
         ax.grid(alpha=0.3)
-    axes[0, 0].legend()
+    handles = axes[0, 0].get_legend_handles_labels()
+    sheet.legend(*handles, loc="outside lower center", ncols=4)
     return sheet

@@ -20,12 +20,11 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax import Setting, evaluate, load
+from rps_jax import Setting, evaluate
 from rps_jax.analysis import statistics
 from rps_jax.app.cli import flags
 from rps_jax.questions import Run, call_of, option
-from rps_jax.record import provenance
-from sweeps.study_base import Parts, QuickStudy, Table, write_table
+from sweeps.study_base import CollectedStudy, Parts, QuickStudy, Table
 
 # `learned_gru.npz` and `learned_mlp.npz` are the laws of 0.3, with which variants start.
 DOMAINS = ("wide", "hostile", "real")
@@ -79,7 +78,7 @@ _COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Variants(QuickStudy[xr.Dataset]):
+class Variants(CollectedStudy, QuickStudy[xr.Dataset]):
     """Compare variants of learning at equal wall clock, in worlds for validation.
 
     The answer has the `successes` and the `median_time` [s] of each law (variant, domain), and the
@@ -92,8 +91,6 @@ class Variants(QuickStudy[xr.Dataset]):
     DIMENSION = "variant"
     REPORTS_TIMES = True
 
-    runs: tuple[str, ...] = option((), positional=True)
-    """Run folders of this study, to collect their results."""
     variants: tuple[str, ...] = tuple(VARIANTS)
     """Names of the variants to run."""
     minutes: float = option(6.0, 0, 1e5, unit="min")
@@ -124,12 +121,6 @@ class Variants(QuickStudy[xr.Dataset]):
         names = () if self.runs else self.variants
         return {name: partial(self._learn, name, folder / _folder(name)) for name in names}
 
-    def answer(self, run: Run) -> xr.Dataset:
-        """Run the variants, or collect the results of other run folders."""
-        if self.runs:
-            return xr.concat([load(x) for x in self.runs], "variant")
-        return super().answer(run)
-
     def _learn(self, name: str, folder: Path) -> xr.Dataset:
         """Learn a law, and judge it in each domain."""
         minutes = 0 if self.quick else self.minutes
@@ -159,13 +150,6 @@ class Variants(QuickStudy[xr.Dataset]):
             | {"successes": ("domain", successes), "median_time": ("domain", times)},
             {"domain": list(DOMAINS)},
         )
-
-    def publish(self, results: xr.Dataset, run_folder: Path) -> None:
-        """Write the data file, with the commands of the collected runs."""
-        folders = [Path(x) for x in self.runs] or [run_folder]
-        (table,) = self.report_tables(results)
-        path = self.folder / self.RESULTS / f"{table.name}.json"
-        write_table(path, list(map(provenance.read_environment, folders)), self.machine, table)
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the table of the variants."""

@@ -108,6 +108,21 @@ _CONTINUED = tuple(
     f"rps sweeps/learned/variants.py --variants '{name}' --minutes 11 --out runs/continued_{i}"
     for i, name in enumerate(("continued", "continued, 4,096 worlds", "continued, failures cost 2"))
 )
+_TABLES = "rps tune grad --law sweeps/gradients/tables.py"
+_PLUS_TABLES = ("Plus64", "Plus2048")
+_HOSTILE = (
+    "--windows 512 --trials 128 --validation 512 --checks 128 --worlds 256 --steps 12 --horizon 200"
+)
+_WINDOWS = (
+    "rps learn --initial learned --action-std 0.2 --learning-rate 2e-4 --domain wide hostile "
+    "--num-envs 1024 --drawn 8192 --validation 128 --every 1.5 --horizon 300 --max-lost 150 "
+    "--prioritised 0.5 --success 2 --failure 1 --anneal 0.4 --ema-updates 100 --minutes 4.5 "
+    "--out runs/ppo",
+    "rps tune grad --law sweeps/learned/weights.py:Weights --domain wide hostile --windows 512 "
+    "--trials 64 --validation 128 --checks 256 --worlds 256 --steps 60 --window-steps 60 "
+    "--refresh 10 --learning-rate 0.01 --sigma 0.02 --horizon 100 --fidelity fast --minutes 3.5 "
+    "--out runs/windows",
+)
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 
@@ -375,7 +390,19 @@ RECIPES: dict[str, Recipe] = {
     "gradients_direction": recipe(
         f"rps sweeps/gradients/direction.py --counts 6 64 2048 --truth 4096 {_MACHINE}", cores=15
     ),
-    "gradients_race": recipe(f"rps sweeps/gradients/race.py --wall 10 30 {_MACHINE}", cores=200),
+    "gradients_race": recipe(f"rps sweeps/gradients/race.py {_MACHINE}", cores=240),
+    "gradients_race_wall": recipe(
+        "rps sweeps/gradients/race.py --counts 6 13 64 512 2048 --simulated --wall 10 "
+        f"--file gradients_race_wall {_MACHINE}",
+        cores=40,
+    ),
+    "gradients_tables": recipe(
+        *_each(f"{_TABLES}:{{0}} --domain hostile {_HOSTILE} --out runs/{{0}}", *_PLUS_TABLES),
+        "rps ladder --domain wide hostile --worlds 10000 --seed 69 --laws rps_plus "
+        + " ".join(f"sweeps/gradients/tables.py:{x},runs/{x}/tuned.json" for x in _PLUS_TABLES),
+        cores=60,
+        section=rows.comparison,
+    ),
     "gradients_race_18": recipe(
         "rps sweeps/gradients/race.py --counts 18 --methods derivatives evolution --simulated "
         f"--wall 30 60 120 --file gradients_race_18 {_MACHINE}",
@@ -395,6 +422,13 @@ RECIPES: dict[str, Recipe] = {
         f"rps sweeps/export --tables trials paper worlds bags odd {_MACHINE}",
         f"rps sweeps/export --tables inputs {_MACHINE}",
         cores=60,
+    ),
+    "learned_windows": recipe(
+        *_WINDOWS,
+        "rps ladder --domain wide hostile --worlds 10000 --seed 69 --laws learned "
+        "runs/ppo/policy.npz sweeps/learned/weights.py:Weights,runs/windows/tuned.json",
+        gpu=15,
+        section=rows.comparison,
     ),
     "sb3": recipe(f"rps sweeps/learned/sb3.py {_MACHINE}", cores=3),
     "learned_test": recipe(*_LEARNED, gpu=4, section=rows.beside_first, labels=(*_WIDE, "real")),
