@@ -15,7 +15,7 @@ import math
 import re
 import sys
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
@@ -155,6 +155,19 @@ class Choices:
     """Allowed texts of a field, from a registry that programs extend."""
 
     names: Callable[[], tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Named:
+    """Names that texts of a type may begin with, from a registry; help lists them."""
+
+    names: Callable[[], Iterable[str]]
+
+
+def named_in(hint: Any) -> Named | None:
+    """Return the names of a type, of an alternative of it, or of its items."""
+    parts = (*getattr(hint, "__metadata__", ()), *map(named_in, typing.get_args(hint)))
+    return next((x for x in parts if isinstance(x, Named)), None)
 
 
 def spec_of(annotation: Any) -> Spec | None:

@@ -7,6 +7,7 @@
 
 import argparse
 import contextlib
+import functools
 import io
 import json
 import os
@@ -53,6 +54,7 @@ def flags_of(command: str) -> Flags:
     return flags
 
 
+@functools.cache
 def all_flags() -> dict[str, Flags]:
     """Return the flags of all commands, by command."""
     return {command: flags_of(command) for command in sorted(names.known())}

@@ -227,6 +227,7 @@ COMMANDS = {
         "--minutes 0": "minutes = 0 is not allowed without updates",
         "--num-envs 1 --num-minibatches 4": "num_minibatches = 4 is not allowed: there are only 3",
         "--engine mujoco": "engine = mujoco is not allowed",
+        "--task pose": "task = pose is not allowed: a learned law does not sense the heading",
     },
     "regress --laws rps": {"--against best": "unknown against 'best': choose from rps, "},
     "export c --law rps": {"--skin ideal": "name one with taxels", "--prefix 2": "prefix = 2 is"},

@@ -19,13 +19,18 @@ from helpers import ROOT, printed, refusal, refusing, rps, setting_of
 import rps_jax
 from rps_jax.app.cli import flags, names, running
 from rps_jax.control import registry
+from rps_jax.control.registry import LAWS
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.robot.robot import ROBOTS
+from rps_jax.robot.skin import SKINS
 from rps_jax.runs.question import Question
 from rps_jax.runs.sweep import merge
 from rps_jax.trials.results import DIMS
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.world import paper
+from rps_jax.world.domain import DOMAINS
+from rps_jax.world.tasks import TASKS
 
 PAGES = [
     page
@@ -33,7 +38,9 @@ PAGES = [
     for page in (ROOT / folder).rglob("*.md")
 ]
 COMMAND = re.compile(
-    r"(?:^|`|&& )(?:\.venv/bin/)?rps ((?:tune |export )?[a-z]+) (-[^`\n|>]*)(?:`|$)", re.M
+    rf"(?:^|`|&& )(?:\.venv/bin/)?rps ({'|'.join(sorted(names.known(), reverse=True))})"
+    r" ([^`\n|>]*)(?:`|$)",
+    re.M,
 )
 SMALL = "table --targets 0.6 0 0.62 0.03 --horizon 18 --slots 8 --workers 1 --laws rps nps"
 SMALL += " --objects box nonuniform_box --out"
@@ -220,6 +227,19 @@ def test_commands_flags_and_defaults_equal_the_record():
     assert defaults(command_line.all_flags()) == defaults(recorded)
 
 
+REGISTRIES = {"--task": TASKS, "--robot": ROBOTS, "--domain": DOMAINS, "--skin": SKINS}
+
+
+@pytest.mark.parametrize(("flag", "registry"), REGISTRIES.items())
+def test_help_names_all_that_is_registered(flag, registry):
+    commands = command_line.all_flags()
+    assert "fixed to" not in json.dumps(commands)  # of a field that no text can set
+    texts = {c: f[flag]["help"] for c, f in commands.items() if flag in f}
+    assert texts
+    for text in texts.values():
+        assert set(registry) <= set(text.partition(" Names: ")[2].rstrip(".").split(", "))
+
+
 IMPORT = """
 import os, sys
 before = dict(os.environ)
@@ -265,6 +285,28 @@ def test_a_quick_run_keeps_an_explicit_value_that_equals_the_default():
     assert (called.worlds, called.tuned, called.population) == (7, ("logistic",), quick.population)
     assert called.setting.engine == small["setting.engine"]
     assert default.with_quick_values() == default
+
+
+@pytest.mark.parametrize("name", [x for x, law in LAWS.items() if registry.law_of(law).bounds])
+@pytest.mark.parametrize("command", ["tune es", "tune grad"])
+def test_quick_suits_each_law(command, name):
+    law = registry.law_of(LAWS[name])
+    robot = f"ideal,drive={law.drives[0]}" + ",turning_radius=0.5" * (law.drives[0] == "car")
+    words = [
+        "--quick",
+        "--law",
+        name,
+        "--robot",
+        robot,
+        "--task",
+        "pose" if law.heading else "reach",
+    ]
+    question = flags.parse(names.question_type(command), command, words)[0]
+    question.validate()
+    assert (
+        question
+        == type(question)(law=name, robot=robot, task=question.task, quick=True).with_quick_values()
+    )
 
 
 def test_files_of_equal_names_are_distinguished_by_their_folders(tmp_path):
@@ -328,5 +370,6 @@ def test_pages_name_options_that_exist():
         try:
             flags.parse(names.question_type(name), name, shlex.split(options, comments=True))
         except InputError as error:
-            unknown += [str(error)] * str(error).startswith("unknown option")
+            text = str(error)
+            unknown += [text] * (text.startswith("unknown option") or "be parsed" in text)
     assert not unknown

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import refusing
+from helpers import refusing, rps
 from numpy.testing import assert_allclose
 
 import rps_jax
@@ -166,6 +166,9 @@ def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_
     paths = str(tmp_path / "outline.csv"), str(tmp_path / "pushes.csv")
     fitted = rps_jax.fit_object(*paths, RADIUS)
     assert 0.1 < fitted.friction < 0.4
+    assert len(repr(fitted)) < 500
+    assert rps(f"fit object {' '.join(paths)} --radius {RADIUS} --out", tmp_path / "run") == 0
+    assert f"{fitted.friction:.2f}" in (tmp_path / "run/report.md").read_text()
     swapped = table.assign(time=1 - table.time)
     with refusing("times increase"):
         rps_jax.fit_object(SQUARE, swapped, RADIUS)

@@ -26,8 +26,8 @@ class Export(Command[Path]):
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
     policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
     robot: RobotLike = "ideal"
-    """The robot, whose boards the skin has: ideal, kairos (the paper's), ridgeback, mpo_500 or
-    round, or a JSON file of its size, boards and limits."""
+    """The robot, whose boards the skin has: its name, or a JSON file of its size, boards, drive and
+    limits."""
     skin: SkinLike = "capacitive"
     """The skin with taxels: capacitive, with changes, as capacitive,threshold=0.3."""
     prefix: str = ""

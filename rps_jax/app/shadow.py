@@ -46,8 +46,8 @@ class Shadow(BagQuestion[xr.Dataset]):
     law: LawLike = "rps_plus"
     """The law, by its name or its file, with changes, as rps_plus,mine.json."""
     robot: RobotLike = "ideal"
-    """The robot of a bag that has taxels but no contacts: ideal, kairos, ridgeback, mpo_500 or
-    round, or a JSON file of its size and boards."""
+    """The robot of a bag that has taxels but no contacts: its name, or a JSON file of its size and
+    boards."""
 
     lookahead: float = option(1.0, 0.05, 5, unit="m")
     """Lookahead on the path of a bag that has no target [m]."""

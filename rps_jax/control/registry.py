@@ -38,6 +38,7 @@ from rps_jax.record.files import JsonObject
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.robot import DriveKind
+from rps_jax.spec import Named
 
 T = TypeVar("T")  # a pytree
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
@@ -48,9 +49,11 @@ STORED_LAWS = Stored(
         label: params_from_json(values, folder) for label, values in dict(entries[name]).items()
     },
 )
-LawLike = Annotated[str | Any, STORED_LAW]  # text that names a law, or parameters of its class
+_NAMED = Named(lambda: LAWS)
+# Text that names a law, or parameters of its class.
+LawLike = Annotated[str | Any, STORED_LAW, _NAMED]
 # One law or several, or labelled laws.
-LawsLike = Annotated[str | Any | Sequence[Any] | Mapping[str, Any], STORED_LAWS]
+LawsLike = Annotated[str | Any | Sequence[Any] | Mapping[str, Any], STORED_LAWS, _NAMED]
 
 LAWS: dict[str, LawParams] = {}  # parameters of all offered laws, by name
 _HIDDEN: dict[str, LawParams] = {}  # of laws that are not offered: names with an underscore

@@ -22,7 +22,7 @@ from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
 from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.shell import BOARDS, HALF_LENGTH, HALF_WIDTH, Boards, Shell
-from rps_jax.spec import Spec
+from rps_jax.spec import Named, Spec
 
 # A number or an array of a batch, on the host or traced. `Any`: NumPy's, JAX's and Python's numbers
 # have no common type with arithmetic.
@@ -372,7 +372,8 @@ ROBOTS: dict[str, Robot] = {
 }
 
 
-RobotLike = Robot | str | Mapping[str, Any]  # or its text: see `parse_robot`
+# Or its text: see `parse_robot`.
+RobotLike = Annotated[Robot | str | Mapping[str, Any], Named(lambda: ROBOTS)]
 
 
 def parse_robot(robot: RobotLike) -> Robot:

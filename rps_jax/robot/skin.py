@@ -42,7 +42,7 @@ from rps_jax.record.files import Arrays
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.base import normal
 from rps_jax.robot.shell import HALF_WIDTH, Row, Shell, side_lengths
-from rps_jax.spec import Spec
+from rps_jax.spec import Named, Spec
 
 _NODES = 16  # points on each row of boards of the smooth ideal sensor
 _REACH = 8.0  # [1] temperatures beyond the tolerance at which the points end: weight 3e-4
@@ -420,7 +420,7 @@ SKINS: dict[str, Skin] = {
 }
 
 
-SkinLike = str | Skin  # a sensor, or its text: see `parse_skin`
+SkinLike = Annotated[str | Skin, Named(lambda: SKINS)]  # a sensor, or its text: see `parse_skin`
 
 
 def parse_skin(skin: SkinLike) -> Any:

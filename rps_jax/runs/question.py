@@ -238,6 +238,14 @@ def quick_command(command: C) -> C:
     return quick
 
 
+def quick_defaults(command: C) -> C:
+    """Return the defaults of a command, with its quick values."""
+    defaults = type(command)()
+    for name, value in command.quick_values().items():
+        defaults = _replace_field(defaults, name, value)
+    return defaults
+
+
 def _replace_field(record: D, name: str, value: object) -> D:
     """Return a dataclass with another value of a field, or of a field of a field, OWNER.FIELD."""
     owner, _, inner = name.partition(".")
@@ -458,14 +466,10 @@ class TaskOption:
     """Options of questions about random worlds."""
 
     robot: RobotLike | None = None
-    """The robot: ideal, slipping, kairos (the paper's), ridgeback, mpo_500 or round; turtlebot4,
-    jackal, husky, mir100, pioneer_3dx or f1tenth, which cannot move sideways; or a JSON file of its
-    size, boards, drive and limits. By default the domain's, which is ideal but in the domain
-    real."""
+    """The robot: its name, or a JSON file of its size, boards, drive and limits; changes follow,
+    as kairos,force_max=300. By default the domain's, which is ideal but in the domain real."""
     task: TaskLike | None = None
-    """The task: reach (one target, as in the paper), path (follow a path by a lookahead),
-    corridor (a path between walls that end a trial when touched) or rooms (a planned path among the
-    obstacles of a map), or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
+    """The task: its name, or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
     Changes follow, as corridor,width=1.2:1.6. By default the domain's, reach."""
 
     @property
@@ -482,8 +486,8 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
     """Question about random worlds of a domain."""
 
     domain: DomainLike = "wide"
-    """Ranges from which worlds are drawn: paper, hardware, wide, real (wide, but with limited
-    robots), prisms or hostile, or a JSON file of ranges. Changes follow, as wide,mass=3:10."""
+    """Ranges from which worlds are drawn: their name, or a JSON file of ranges. Changes follow, as
+    wide,mass=3:10."""
 
     @functools.cached_property
     def ranges(self) -> Domain:

@@ -70,9 +70,8 @@ class Hardware(LawQuestion[xr.Dataset]):
     """The skin: ideal, thin, capacitive, or hardware, which has noise and unequal gains; changes
     follow, as capacitive,foam=0.01."""
     robot: RobotLike = "slipping"
-    """The robot: slipping (its wheels lose shares of the twist, by which the paper's results come
-    out), ideal (it follows every twist at once, with any force), kairos (the paper's), ridgeback,
-    mpo_500 or round, or a JSON file of its size, boards and limits."""
+    """The robot: its name, or a JSON file of its size, boards and limits. The wheels of `slipping`
+    lose shares of the twist, by which the paper's results come out."""
     layout: Literal["circle", "grid"] = "circle"
     """Layout of the eight targets: circle (each 2.1 m from the start) or grid (2.1 m apart in x and
     y)."""

@@ -81,8 +81,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or policy.npz; changes follow each, as
     rps,K_h=0.3 or rps,tuned.json."""
     domain: DomainLike | Sequence[DomainLike] = ("wide",)
-    """Domains: paper, hardware, wide, real (wide, but with limited robots), prisms or hostile, or
-    JSON files of ranges. Changes follow each, as wide,mass=3:10."""
+    """Domains: their names, or JSON files of ranges. Changes follow each, as wide,mass=3:10."""
     worlds: int | None = option(None, 1, 1_000_000_000)
     """Number of worlds of each domain; by default 1000, or the grid of a domain with listed targets
     (paper: 144). With several domains it is at most that grid."""

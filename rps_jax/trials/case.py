@@ -38,11 +38,8 @@ class TrialOptions:
     """Side of the nonuniform box on which its load stands, seen from the robot; left open by the
     paper."""
     robot: RobotLike = "ideal"
-    """The robot: ideal (it follows every twist at once, with any force), slipping (its wheels lose
-    shares of the twist), kairos (the paper's), ridgeback, mpo_500 or round (a disc as wide as
-    the paper's base); turtlebot4, jackal, husky, mir100, pioneer_3dx or f1tenth, which cannot move
-    sideways; or a JSON file of its size, boards, drive and limits. Changes follow, as
-    kairos,force_max=300."""
+    """The robot: its name, or a JSON file of its size, boards, drive and limits. Changes follow, as
+    kairos,force_max=300. The robot `ideal` follows every twist at once, with any force."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +64,8 @@ class Case(TrialOptions):
     policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json. By default rps, or unicycle on a
     base that cannot move sideways."""
     task: TaskLike = option("reach", kw_only=True)
-    """The task: reach (one target, as in the paper), path (follow a path by a lookahead),
-    corridor (a path between walls that end a trial when touched), rooms (a planned path among the
-    obstacles of a map) or pose (the pushed face arrives at the target with a heading), or a file,
-    as JSON of waypoints or of polygons, or a ROS map.yaml. Changes follow, as corridor,width=1.2.
-    Ranges are drawn by the seed."""
+    """The task: its name, or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
+    Changes follow, as corridor,width=1.2. Ranges are drawn by the seed."""
     bearing: float = option(0.0, -6.3, 6.3, unit="rad", kw_only=True, hidden=True)
     """Rotation of the whole trial [rad]; only a friction pyramid makes a difference."""
     shift: Shift = option(Shift(), kw_only=True, hidden=True)

@@ -108,8 +108,8 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     }
 
     domain: Domains = ("wide",)
-    """Domains to learn in: wide, real, prisms, hostile, or JSON files of ranges; changes follow
-    each, as wide,objects=random_box."""
+    """Domains to learn in: their names, or JSON files of ranges; changes follow each, as
+    wide,objects=random_box."""
     minutes: float = option(10.0, 0, 1e5, unit="min")
     """Wall clock after which the run stops [min], with compilation and validation, summed over all
     processes of the run; 0 means no limit."""
@@ -146,6 +146,9 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         errors.check_each_once("domain", self.domains)
         for domain in self.domains:
             errors.check_name("skin of a domain to learn in", domain.skin, ("capacitive",))
+            if domain.task.HAS_HEADING:
+                rule = "a learned law does not sense the heading of a goal; choose another task"
+                raise errors.not_allowed("task", domain.task.kind, rule)
         self.setting.simulator.check_traced()
         count = self.num_envs * sum(len(domain.objects) for domain in self.domains)
         if self.num_minibatches > count:

@@ -12,7 +12,7 @@ direction of a push corrects what the fitted pushes leave nearby.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -190,13 +190,17 @@ _derivatives = jax.jit(jax.jacfwd(_simulate))  # by the parameters, along the la
 class ObjectFit:
     """Fitted object: parameters, their covariance, and predictions."""
 
-    data: xr.Dataset  # `mean`, `deviation`, `prior` (parameter), `covariance`, `gap` (push) [m]
+    # `mean`, `deviation`, `prior` (parameter), `covariance`, `gap` (push) [m]
+    data: xr.Dataset = field(repr=False)
     outline: np.ndarray  # (N, 2) [m] counter-clockwise
     radius: float  # [m] of the finger
     quantile: Mapping[str, float]  # of the errors over their scatter, at 90 %
-    pads: np.ndarray  # (S, 4) of even pressure: x, y [m], share [1] and radius [m]
+    # (S, 4) of even pressure: x, y [m], share [1] and radius [m]
+    pads: np.ndarray = field(repr=False)
     # Fitted pushes (n, 6) as of `_traits`, and their weights (n, 3) [m, m, rad] for other pushes
-    nearby: tuple[np.ndarray, np.ndarray] = (np.zeros((0, 6)), np.zeros((0, 3)))
+    nearby: tuple[np.ndarray, np.ndarray] = field(
+        default=(np.zeros((0, 6)), np.zeros((0, 3))), repr=False
+    )
 
     @property
     def friction(self) -> float:
@@ -446,18 +450,18 @@ class FitObject(Question[ObjectFit]):
 
     TITLE = "An object fitted to pushes"
 
-    outline: Any = option((), positional=True)
+    outline: str | Any = option("", positional=True)
     """Corners x, y [m] of a simple polygon in the object's frame: an array, or a table FILE.csv
     with the columns x and y."""
-    pushes: Any = option((), positional=True)
+    pushes: str | Any = option("", positional=True)
     """Table FILE.csv of pushes: push, time, x, y, yaw of the object, tip_x, tip_y of the finger's
     middle; in Python also a data frame."""
     radius: float = option(0.005, 1e-4, 0.5, unit="m")
     """Radius of the finger."""
-    feet: Any = option(None, kw_only=True)
+    feet: Any = option(None, kw_only=True, hidden=True)
     """Known feet x, y [m] (S, 2) of the object, in Python; by default it has pressure under all of
     its outline."""
-    prior: Any = option(None, kw_only=True)
+    prior: Any = option(None, kw_only=True, hidden=True)
     """Priors (mean, standard deviation) of parameters by name, in Python; by default `PRIOR`."""
 
     def answer(self, run: Run) -> ObjectFit:
@@ -470,12 +474,15 @@ class FitObject(Question[ObjectFit]):
 
     def report(self, results: ObjectFit, run: Run) -> Sequence[Section]:
         data = results.data
-        rows: Rows = [["parameter", "mean", "standard deviation"]]
+        rows: Rows = [["parameter", "unit", "mean", "standard deviation"]]
         for name in PRIOR:
-            row = data.sel(parameter=name)
-            rows.append([name, f"{float(row['mean']):.4g}", f"{float(row.deviation):.2g}"])
+            row, unit = data.sel(parameter=name), _OFFSETS.get(name, "1")
+            rows.append([name, unit, f"{float(row['mean']):.4g}", f"{float(row.deviation):.2g}"])
         gap = 1e3 * float(abs(data.gap).median())
-        text = f"{results.misplaced} The gap at the end of the pushes is {gap:.2f} mm (median)."
+        text = (
+            f"The friction between object and finger is {results.friction:.2f}. "
+            f"{results.misplaced} The gap at the end of the pushes is {gap:.2f} mm (median)."
+        )
         return [Section("Parameters", text, rows)]
 
 

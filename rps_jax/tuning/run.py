@@ -87,8 +87,8 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     """Law with the initial parameters: a name, as rps, rps_tuned or rps_plus, or a file's class
     with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
     domain: Domains = ("wide",)
-    """Domains to tune in: paper, hardware, wide, real, prisms, hostile, or JSON files of ranges;
-    changes follow each, as wide,mass=3:10."""
+    """Domains to tune in: their names, or JSON files of ranges; changes follow each, as
+    wide,mass=3:10."""
     objects: Annotated[tuple[str, ...], STORED] = ("random_box", "random_cylinder")
     """Objects of these domains; random_prism is held out by default."""
     tuned: tuple[str, ...] = ("full",)
@@ -161,16 +161,20 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     # ---------------------------------------------------------------------------------------
 
     def quick_values(self) -> Mapping[str, object]:
-        """Values of `quick`; its choice of parameters is for RPS alone."""
-        is_rps = isinstance(self.params, type(registry.LAWS["rps"]))
-        return {k: v for k, v in self.QUICK.items() if k != "tuned" or is_rps}
+        """Values of `quick`; parameters for RPS alone, an engine for laws that sense no force."""
+        values = dict(self.QUICK)
+        if not isinstance(self.params, type(registry.LAWS["rps"])):
+            del values["tuned"]
+        if registry.law_of(self.params).senses == "force":
+            del values["setting.engine"]
+        return values
 
     def check(self) -> None:
         if not registry.law_of(self.params).bounds:
             names = [n for n, params in registry.LAWS.items() if registry.law_of(params).bounds]
             rule = (
                 f"its parameters have no bounds; choose from {', '.join(names)}, or give a custom "
-                'law Law(..., bounds={"NAME": Bound(low, high)})'
+                'law Law(..., bounds={"NAME": rps_jax.laws.Bound(low, high)})'
             )
             raise errors.not_allowed("law", self.label, rule)
         for domain in self.domains:

@@ -18,6 +18,7 @@ from rps_jax.record.folder import describe_difference
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.robot import LATENCIES, Robot, RobotLike, parse_robot
+from rps_jax.spec import Named
 from rps_jax.world import paper, scene, tasks
 from rps_jax.world.objects import (
     FAMILIES,
@@ -484,7 +485,8 @@ STORED = Stored(
     kinds=(str, Domain),
     label=name_or_custom,
 )
-DomainLike = Annotated[Domain | str, STORED]  # or its text: see `parse_domain`
+# Or its text: see `parse_domain`.
+DomainLike = Annotated[Domain | str, STORED, Named(lambda: DOMAINS)]
 
 
 def parse_domain(

@@ -26,6 +26,7 @@ from rps_jax.record import files, options
 from rps_jax.record.files import Arrays, JsonObject
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import check_arguments
+from rps_jax.spec import Named
 from rps_jax.world.opengl import mujoco
 
 SHAPES = ("box", "cylinder", "prism")  # the shape families
@@ -167,7 +168,7 @@ def _stored(name: str, objects: str | Sequence[str]) -> JsonObject:
 
 
 STORED = Stored(_stored)
-ObjectLike = Annotated[str, STORED]  # name of an object, or its file
+ObjectLike = Annotated[str, STORED, Named(lambda: OBJECTS)]  # name of an object, or its file
 
 
 def read(path: Path) -> mujoco.MjSpec:

@@ -32,6 +32,10 @@ class Range(NamedTuple):
 
     EXAMPLE = "Range(3, 10)"  # for errors
 
+    def __str__(self) -> str:
+        """Return the text of a domain, as 3:10."""
+        return f"{self.low:g}:{self.high:g}"
+
     def at(self, u: np.ndarray) -> np.ndarray:
         """Return the quantity at u in [0, 1)."""
         if self.log:

@@ -22,12 +22,12 @@ import rps_jax
 from rps_jax import Range, Setting
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import WIDTH, Figure, tiles, words
+from rps_jax.geometry.solid import SUPPORTS
 from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.world import paper, points
 from rps_jax.worlds import parse_domain
 from sweeps.study_base import Parts, QuickStudy, Table, records, run_parts, text_table
 
-SUPPORTS = {"even": 0.0, "rim": 1.0, "corners": 2.0}  # as of a domain
 LAWS = ("rps", "rps_tuned", "rps_plus")
 # The grid of the hardware: friction object-robot, and shares of v_x, v_y and omega that are lost.
 FRICTIONS = (0.35, 0.6, 0.9, 1.2)

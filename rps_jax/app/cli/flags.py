@@ -32,8 +32,14 @@ from rps_jax.errors import InputError, check_name, suggest
 from rps_jax.record import options
 from rps_jax.record.options import option
 from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
-from rps_jax.runs.question import Command, Question, SimulationQuestion, current_names
-from rps_jax.spec import Spec, specs_of
+from rps_jax.runs.question import (
+    Command,
+    Question,
+    SimulationQuestion,
+    current_names,
+    quick_defaults,
+)
+from rps_jax.spec import Spec, named_in, specs_of
 from rps_jax.trials.setting import PhysicsField, Setting
 from rps_jax.trials.trial import Rules
 
@@ -96,9 +102,7 @@ def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q
     words = [_current_flag(question_type, word) for word in words]
     question, session = _parse(question_type(), command, words)
     if getattr(question, "quick", False):
-        quick = dataclasses.replace(question_type(), quick=True).with_quick_values()
-        defaults = dataclasses.replace(quick, quick=False)
-        question, session = _parse(defaults, command, words)
+        question, session = _parse(quick_defaults(question), command, words)
     options.check_fields(session)
     return question, session
 
@@ -217,11 +221,18 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
         if get_origin(kind) is Sequence:
             kind = tuple[get_args(kind)[0], ...]
         marked = typing.cast(type, Annotated[(kind, *marks)] if marks else kind)
-        text = partial(_field_docs, info.type, field.name, info.markers)
+        text = partial(_text_of, info.type, field.name, info.markers)
         if (spec := declared.get(field.name)) is not None and spec.about:
             text = _help_of(spec)
         specs.append(StructFieldSpec(field.name, marked, default, text))
     return StructConstructorSpec(info.type, tuple(specs))
+
+
+def _text_of(kind: type, name: str, markers: tuple[Any, ...]) -> str:
+    """Return the help of a field: its docstring, and the names that its texts may begin with."""
+    named = named_in(typing.get_type_hints(kind, include_extras=True)[name])
+    names = f" Names: {', '.join(named.names())}." if named else ""
+    return (_field_docs(kind, name, markers) or "") + names
 
 
 def _help_of(spec: Spec) -> str:

@@ -96,7 +96,7 @@ class UnicycleParams(NamedTuple):
         Parameter, Spec("m", "offset of a spent contact", ge=0, tune=Bound(0.1, 0.35))
     ] = 0.3263
     e_far: Annotated[
-        Parameter, Spec("rad", "error of a spent contact", ge=0, tune=Bound(0.5, 3.2))
+        Parameter, Spec("rad", "error of a spent contact", ge=0, tune=Bound(0.5, 3.4))
     ] = 1.6
     d_near: Annotated[Parameter, Spec("m", "distance of D5", ge=0, tune=Bound(0.05, 1))] = 0.5245
     e_near: Annotated[

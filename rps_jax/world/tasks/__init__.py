@@ -16,7 +16,7 @@ from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import field_types, parse_changes
-from rps_jax.spec import Spec
+from rps_jax.spec import Named, Spec
 from rps_jax.world.quantity import Quantity, claim, declared, numbers_of, range_of
 from rps_jax.world.tasks.base import Task
 
@@ -74,7 +74,8 @@ def _stored(name: str, task: Any) -> JsonObject:
 
 
 _KINDS = (Task, str, Mapping, type(None))
-TaskLike = Annotated[Task | str | Mapping[str, Any], Stored(_stored, kinds=_KINDS)]
+_NAMED = Named(lambda: TASKS)
+TaskLike = Annotated[Task | str | Mapping[str, Any], Stored(_stored, kinds=_KINDS), _NAMED]
 
 
 def failures_of(outcomes: Mapping[str, Any]) -> list[str]:
