@@ -21,15 +21,15 @@ behind the contact. Let g = h_2 be the way that is left, and m the middle of the
 goal's line by y.
 
   Q4  leg: k = 2 if g < s_min, or s_flush where a side is known;  else k = 1 or 3 towards y = 0 if
-      |y| > y_tol + cap g + reach kappa (g - 0.34 m)^2 / 4;  else k = 0
-  Q5  its end: k = 2 at g > s_min + s_back;  k = 1 and 3 at y = 0;  k = 0 at g = 0
+      |y| > y_tol + cap g + reach kappa (g - s_line)^2 / 4;  else k = 0
+  Q5  its end: k = 2 at g > s_min + s_back;  k = 1 and 3 at y = 0;  k = 0 at g < stop
 
 The law is done where the last leg ends, unless the contact is uneven or |y| > y_miss. Then it
-chooses again, up to three times. It is also done at the time t_end. With the offset c to the left
+chooses again, up to `tries` times. It is also done at the time t_end. With the offset c to the left
 of the base of m, or of the goal's line in a last leg that touches:
 
   Q6  push: v_x = v_max, slower near the end;  v_y = K_y c within slope v_x;  omega towards the leg
-  Q7  back off by `back`: contact lost or off the front, |c| > l_edge (0.25 m where uneven) before
+  Q7  back off by `back`: contact lost or off the front, |c| > l_edge (l_turn where uneven) before
       the last 0.2 m, or a new leg
   Q8  around m on a circle R beyond the box to a point `gap` behind its face, turned to d_k; push
   Q9  look: where a leg with k = 0 or 2 does not know an end of its face, c is that of the point
@@ -41,13 +41,14 @@ the pressure moves along the face until its moment turns the box, and needs no f
 the half width w on its corners follows up to the curvature w / (w^2 + depth^2), hence
 
   Q10 kappa = turn w / (w^2 + r^2);  with the middle c_G left of the goal's line, and the heading
-      theta - K_h c_G within h_max:  omega = v clip(9.4 / m (heading - yaw), +-kappa),
+      theta - K_h c_G within h_max:  omega = v clip(K_e (heading - yaw), +-kappa),
       v_y = -omega (r + the distance of the front)
 
-Without contact v_free and omega_free are the bounds; a base nears the box at its distance times
-1 / s. A base that cannot move sideways steers in Q6: omega towards the leg + K_h c, within h_max;
-in Q8 it drives in reverse. The law needs a flat front. In its smooth form the contact is a weight
-that mixes the twists of Q6; modes and legs switch.
+Without contact v_free and omega_free are the bounds; the base nears the box at its distance
+times 1 / s. A base that cannot move sideways steers in Q6:
+omega towards the leg + K_h c, within h_max; in Q8 it drives forwards or in reverse. The law needs a
+flat front. In its smooth form the contact is a weight that mixes the twists of Q6; modes and legs
+switch.
 """
 
 from functools import partial
@@ -59,7 +60,7 @@ import jax.numpy as jnp
 from rps_jax import spec
 from rps_jax.control import soft
 from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SpeedMax, SuccessDistance, bounds_of
-from rps_jax.control.laws.unicycle import contact_of, way_around
+from rps_jax.control.laws.unicycle import contact_of, turn_around
 from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Parameter
@@ -72,14 +73,9 @@ _FLUSH, _UNEVEN = 0.4, -1.0  # [s] of even contact, and of uneven contact
 _HALF = 0.07, 0.5  # [m] half widths of objects
 _CARROT, _AHEAD = 0.5, 1.0  # [rad] of the aim on the circle: omnidirectional or not
 _PAST = 0.35  # [m] of the front beyond the face, at which an approach has failed
-_STOP = 0.004  # [m] of way left, at which the law is done
-_TRIES = 3  # [repetitions] at most
-_TURNED_EDGE = 0.25  # [m] the offset of a bad contact that is uneven
-_STRAIGHT = 0.34  # [m] straight end of the last leg, Q4
-_CURVE = 9.4  # [1/m] curvature for an error of the heading of 1 rad, Q10
 _HALF_FRONT = 0.29  # [m]
 _AROUND, _CENTRAL = 0.08, 0.2  # [m] behind the front, and from its middle
-_TURNS = 0.8  # [rad] between base and leg, up to which the base turns while it touches
+_TURNS = 0.8  # [rad] between base and leg, up to which it feels the box and turns while it touches
 
 
 @document
@@ -111,6 +107,8 @@ class PoseParams(NamedTuple):
     y_miss: Annotated[
         Parameter, Spec("m", "error of a last leg that is repeated", ge=0, tune=Bound(0, 0.1))
     ] = 0.025
+    stop: Annotated[Parameter, Spec("m", "way left at the end, Q5", ge=-0.1)] = 0.004
+    tries: Annotated[Parameter, Spec("1", "number of repetitions", ge=0)] = 3.0
     slope: Annotated[
         Parameter, Spec("1", "sideways over forward speed, Q6", ge=0, tune=Bound(0.02, 0.6))
     ] = 0.2135
@@ -132,6 +130,15 @@ class PoseParams(NamedTuple):
         Parameter,
         Spec("1", "share of a turn that the last leg may use, Q4", ge=0, tune=Bound(0, 1.5)),
     ] = 0.7677
+    s_line: Annotated[
+        Parameter, Spec("m", "straight end of the last leg, Q4", ge=0, tune=Bound(0, 0.8))
+    ] = 0.3371
+    K_e: Annotated[
+        Parameter,
+        Spec(
+            "1/m", "curvature for an error of the heading, Q10", ge=0, tune=Bound(1, 20, log=True)
+        ),
+    ] = 9.391
     omega_push: Annotated[
         Parameter,
         Spec("rad/s", "bound on |omega| in contact", gt=0, tune=Bound(0.005, 0.15, log=True)),
@@ -139,6 +146,9 @@ class PoseParams(NamedTuple):
     l_edge: Annotated[
         Parameter, Spec("m", "offset of a bad contact, Q7", ge=0, tune=Bound(0.05, 0.3))
     ] = 0.1418
+    l_turn: Annotated[
+        Parameter, Spec("m", "the same, of an uneven contact, Q7", ge=0, tune=Bound(0.1, 0.3))
+    ] = 0.2511
     back: Annotated[Parameter, Spec("m", "retreat, Q7", ge=0, tune=Bound(0.02, 0.6))] = 0.09401
     R: Annotated[
         Parameter, Spec("m", "radius of the circle beyond the box, Q8", gt=0, tune=Bound(0.4, 1))
@@ -156,32 +166,16 @@ class PoseParams(NamedTuple):
     t_end: Annotated[Parameter, Spec("s", "time at which the law gives up", gt=0)] = 290.0
 
 
-def _turned(values: Array, leg: Array) -> Array:
-    """Return values (4,) of the four directions, from that of a leg on."""
-    turns = (1, 2, 3)
-    return jnp.select([leg == k for k in turns], [jnp.roll(values, -k) for k in turns], values)
-
-
-class Box(NamedTuple):
-    """Box that the law remembers, in the frame of the goal or of a leg."""
-
-    h: Annotated[jax.Array, Spec("m", "supports ahead, left, behind and right, Q1 to Q3")]  # (4,)
-    known: Annotated[jax.Array, Spec("1", "whether each is known")]  # (4,) bool
-    centred: Annotated[jax.Array, Spec("1", "whether the middle of each axis was felt")]  # (2,)
-
-    def turned(self, leg: Array) -> "Box":
-        """Return the box from the direction of a leg on."""
-        centred = jnp.where(leg % 2 == 1, self.centred[::-1], self.centred)
-        return Box(_turned(self.h, leg), _turned(self.known, leg), centred)
-
-
 class PoseState(NamedTuple):
     """State of the law between two control steps."""
 
     mode: Annotated[jax.Array, Spec("1", "0 push or approach, 1 back off, 2 drive around")]
     leg: Annotated[jax.Array, Spec("1", "k, direction of the push in quarter turns from theta")]
-    box: Box
+    h: Annotated[jax.Array, Spec("m", "supports of the box in the grid, Q1 to Q3")]  # (4,)
+    known: Annotated[jax.Array, Spec("1", "whether each is known")]  # (4,) bool
+    centred: Annotated[jax.Array, Spec("1", "whether the middle of each axis was felt")]  # (2,)
     p_world_contact: Annotated[jax.Array, Spec("m", "the last contact")]  # (2,)
+    p_world_front: Annotated[jax.Array, Spec("m", "middle of the front, a step before")]  # (2,)
     p_world_base: Annotated[jax.Array, Spec("m", "filtered position of the base")]  # (2,)
     yaw: Annotated[jax.Array, Spec("rad", "filtered heading of the base")]
     twist: Annotated[jax.Array, Spec("m/s, m/s, rad/s", "last command")]  # (3,)
@@ -195,6 +189,7 @@ class PoseState(NamedTuple):
     looks: Annotated[jax.Array, Spec("1", "number of looks in this leg")]
     tries: Annotated[jax.Array, Spec("1", "number of repetitions")]
     side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around the object; -1: clockwise")]
+    gear: Annotated[jax.Array, Spec("1", "1: forwards around the object; -1: in reverse")]
     done: Annotated[jax.Array, Spec("1", "whether the law is done")]
 
 
@@ -212,11 +207,41 @@ def init(params: PoseParams, temperatures: Smooth | None = None) -> PoseState:
     """Return the state before the first contact."""
     del temperatures
     zero = jnp.zeros_like(jnp.asarray(params.r, float))
-    count, no, sides = jnp.zeros((), jnp.int32), zero > 0, jnp.zeros(4, zero.dtype)
-    box, point = Box(sides, sides > 0, sides[:2] > 0), sides[:2]
-    times, base = (zero,) * 4, (point, zero, sides[:3])
-    look = zero, no, zero, zero, zero + 1, no
-    return PoseState(count, count, box, point, *base, no, *times, *look)
+    count, no, point = jnp.zeros((), jnp.int32), zero > 0, jnp.zeros(2, zero.dtype)
+    sides = jnp.zeros(4, zero.dtype)
+    names = ("p_world_contact", "p_world_front", "p_world_base")
+    return PoseState(*[zero] * len(PoseState._fields))._replace(
+        mode=count,
+        leg=count,
+        h=sides,
+        known=sides > 0,
+        centred=point > 0,
+        twist=sides[:3],
+        **dict.fromkeys(names, point),
+        **dict.fromkeys(("touched", "looking", "done"), no),
+        **dict.fromkeys(("side", "gear"), zero + 1),
+    )
+
+
+def _turned(values: Array, leg: Array) -> Array:
+    """Return values (4,) of the four directions, from that of a leg on."""
+    turned = values
+    for k in (1, 2, 3):
+        turned = jnp.where(leg == k, jnp.roll(values, -k), turned)
+    return turned
+
+
+class Box(NamedTuple):
+    """Box that the law remembers, in the frame of the goal or of a leg."""
+
+    h: Array  # (4,) [m] supports ahead, left, behind and right
+    known: Array  # (4,) bool
+    centred: Array  # (2,) bool: along and across
+
+    def turned(self, leg: Array) -> "Box":
+        """Return the box from the direction of a leg on."""
+        centred = jnp.where(leg % 2 == 1, self.centred[::-1], self.centred)
+        return Box(_turned(self.h, leg), _turned(self.known, leg), centred)
 
 
 def feel(
@@ -230,12 +255,14 @@ def feel(
     sides, was_known = box.h[1::2], known[1::2]
     flush = obs.even & (t_even > _FLUSH)
     # The pushed face: the box moves with it, or another face is there and the middle stays.
-    same = known[2] & (jnp.abs(front + behind) < _SAME)
+    near = -front
+    same = known[2] & (jnp.abs(near - behind) < _SAME)
     middle = jnp.where(centred[0], (ahead - behind) / 2, front + params.r)
     mirrored = front + 2 * jnp.clip(middle - front, *_HALF)
     keeps = known[0] & ~known[2]
-    far = jnp.where(same, ahead + behind + front, jnp.where(keeps, ahead, mirrored))
-    ahead, behind = jnp.where(obs.even, far, ahead), jnp.where(obs.even, -front, behind)
+    far = jnp.where(same, ahead + behind - near, jnp.where(keeps, ahead, mirrored))
+    ahead, behind = jnp.where(obs.even, far, ahead), jnp.where(obs.even, near, behind)
+    far_known = known[0] & (same | keeps | ~obs.even)
     # Its ends, as supports to the left and to the right.
     felt = (lateral + obs.ends) * jnp.array([1.0, -1.0])
     seen = obs.seen & flush
@@ -243,11 +270,11 @@ def feel(
     is_same = is_known & (jnp.abs(felt - sides) < _SAME)
     measured = jnp.where(is_same, sides + 0.1 * (felt - sides), felt)
     unknown = jnp.where(centred[1], jnp.maximum(sides, felt), felt)
-    left, right = jnp.where(seen, measured, jnp.where(is_known, sides, unknown))
-    is_known |= seen
-    far_known = known[0] & (same | keeps | ~obs.even)
-    known = jnp.stack([far_known, is_known[0], known[2] | flush, is_known[1]])
-    return Box(jnp.stack([ahead, left, behind, right]), known, centred | jnp.stack([False, flush]))
+    sides = jnp.where(seen, measured, jnp.where(is_known, sides, unknown))
+    left, right = is_known | seen
+    known = jnp.stack([far_known, left, known[2] | flush, right])
+    h = jnp.stack([ahead, sides[0], behind, sides[1]])
+    return Box(h, known, centred | jnp.stack([False, flush]))
 
 
 def filtered_pose(params: PoseParams, state: PoseState, obs: Observation) -> tuple[Array, Array]:
@@ -256,8 +283,8 @@ def filtered_pose(params: PoseParams, state: PoseState, obs: Observation) -> tup
     guess = state.p_world_base + obs.period * planar.rotate(state.yaw, v)
     yaw = state.yaw + obs.period * omega
     share = jnp.where(state.time > 0, obs.period / (params.tau + obs.period), 1.0)
-    yaw += share * planar.wrap(jnp.asarray(obs.yaw) - yaw)
-    return guess + share * (obs.p_world_robot - guess), planar.wrap(yaw)
+    error = planar.wrap(jnp.asarray(obs.yaw) - yaw)
+    return guess + share * (obs.p_world_robot - guess), planar.wrap(yaw + share * error)
 
 
 def observe_sent(
@@ -278,136 +305,160 @@ def step(
     del temperatures
     touch, omni = obs.touch, obs.touch.axle is None
     axle = jnp.asarray(0.0 if touch.axle is None else touch.axle)
-    (base, yaw), goal = filtered_pose(params, state, touch), touch.p_world_target
+    half_length = obs.front
+    base, yaw, goal = *filtered_pose(params, state, touch), touch.p_world_target
     theta, weight = jnp.asarray(touch.yaw_target), jnp.asarray(touch.in_contact)
     touches = weight if weight.dtype == bool else weight > 0.5
     u = planar.unit(yaw)
     grid = planar.unit(theta + jnp.arange(4) * (jnp.pi / 2))  # (4, 2) d_j
-    p_world_front = base + obs.front * u
+    p_world_front = base + half_length * u
     flat = touch._replace(
-        p_world_robot=base, yaw=yaw, in_contact=touches, base_radius=None, half_length=obs.front
+        p_world_robot=base, yaw=yaw, in_contact=touches, base_radius=None, half_length=half_length
     )
     _, contact, normal, on_front, _ = contact_of(state.p_world_contact, flat)
     # The middle of a contact that reaches around both corners is a little behind the front.
-    on_front |= (contact[0] > obs.front - _AROUND) & (jnp.abs(contact[1]) < _CENTRAL)
+    on_front |= (contact[0] > half_length - _AROUND) & (jnp.abs(contact[1]) < _CENTRAL)
     p_world_contact = base + planar.rotate(yaw, contact)
     first, touched = touches & ~state.touched, state.touched | touches
     time, t_lost = state.time + touch.period, jnp.where(touches, 0.0, state.t_lost + touch.period)
-    leg, pushing = state.leg, state.mode == PUSH
-    is_facing = jnp.abs(planar.wrap(theta + leg * (jnp.pi / 2) - yaw)) < _TURNS
+    psi = theta + state.leg * (jnp.pi / 2)
+    pushing = state.mode == PUSH
+    is_facing = jnp.abs(planar.wrap(psi - yaw)) < _TURNS
     feels = pushing & touches & on_front & is_facing & state.touched
 
     # The box. It moves with the front while this touches.
     change = jnp.where(obs.even, 1.0, jnp.where(state.t_even > 0, -2.0, -1.0)) * touch.period
     t_even = jnp.where(feels, jnp.clip(state.t_even + change, _UNEVEN - 0.1, 1.5), state.t_even)
-    moves = feels & (state.t_lost < 0.1)
-    last = state.p_world_base + obs.front * planar.unit(state.yaw)
-    h = state.box.h + jnp.where(moves, grid @ (p_world_front - last), 0.0)
-    fronts, bases = grid @ (p_world_front - goal), grid @ (base - goal)
-    box = state.box._replace(h=h)
-    along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
+    h = state.h + jnp.where(
+        feels & (state.t_lost < 0.1), grid @ (p_world_front - state.p_world_front), 0.0
+    )
+    leg, fronts, bases = state.leg, grid @ (p_world_front - goal), grid @ (base - goal)
+    along, across = _turned(fronts, leg)[:2]
+    box = Box(h, state.known, state.centred)
     felt = feel(params, box.turned(leg), along, across, obs, t_even).turned(-leg % 4)
-    middle = p_world_contact + params.r * planar.unit(yaw + normal) - goal
-    square = Box(grid @ middle + params.r, jnp.zeros(4, bool), jnp.zeros(2, bool))
+    middle = p_world_contact + params.r * planar.unit(yaw + normal)
     forgets = first | (feels & (t_even <= _UNEVEN))
-    box = soft.tree_where(forgets, square, soft.tree_where(feels, felt, box))
-    grows = touches & ~box.known
-    h = jnp.where(grows, jnp.maximum(box.h, grid @ (p_world_contact - goal)), box.h)
-    known = box.known
+    square = Box(grid @ (middle - goal) + params.r, jnp.zeros(4, bool), jnp.zeros(2, bool))
+    h, known, centred = soft.tree_where(forgets, square, soft.tree_where(feels, felt, box))
+
+    grows = touches & ~known
+    h = jnp.where(grows, jnp.maximum(h, grid @ (p_world_contact - goal)), h)
 
     # Q4 and Q5.
-    y, way, way_left, last_leg = (h[1] - h[3]) / 2, h[2], -fronts[0], leg == 0
+    y, way, way_left = (h[1] - h[3]) / 2, h[2], -fronts[0]
     both = known[1] & known[3]
+    last_leg = leg == 0
     s_min = jnp.where(jnp.any(known), params.s_flush, params.s_min)
     # Q10: the sharpest turn.
     width = jnp.clip((h[1] + h[3]) / 2, *_HALF)
     kappa = params.turn * jnp.minimum(width, _HALF_FRONT) / (width**2 + params.r**2)
     bend = params.reach * kappa / 4 if omni else 0.0
 
-    def is_beyond(way: Array, margin: float) -> Array:
-        """Return whether a last leg of this way [m] cannot correct the error."""
-        turns = bend * jnp.maximum(way - _STRAIGHT, 0.0) ** 2
-        return jnp.abs(y) > params.y_tol + params.cap * jnp.maximum(way, 0.0) + turns + margin
+    def room_of(way: Array) -> Array:
+        """Return the error that a last leg of this way corrects [m]."""
+        way = jnp.maximum(way, 0.0)
+        return params.y_tol + params.cap * way + bend * jnp.maximum(way - params.s_line, 0.0) ** 2
 
-    may_try = state.tries < _TRIES
+    may_try = state.tries < params.tries
     is_back = (leg == 2) & feels & (way > s_min + params.s_back)
     beyond_line = jnp.where(leg == 1, y, -y)  # positive beyond the line
     is_beside = (leg % 2 == 1) & feels & (beyond_line > -0.004)
     has_looked = both | (state.looks >= params.looks)
     settled = (state.t_push > 2) & has_looked & ((t_even > 1) | (state.t_push > 6))
+    room = room_of(way_left)
     is_off = last_leg & feels & settled & may_try
-    is_off = is_off & is_beyond(way_left, 0.01) & (way_left > s_min - 0.1)
-    at_end = last_leg & feels & (way_left < _STOP)
+    is_off = is_off & (jnp.abs(y) > room + 0.01) & (way_left > s_min - 0.1)
+    at_end = last_leg & feels & (way_left < params.stop)
     # A drum is never flush: a long push and a repetition are enough.
     is_uneven = (t_even < 0.3) & ((state.tries < 1) | (state.t_push < 20))
+    is_blind = (t_even >= 0.3) & ~has_looked
     off_line = both & (jnp.abs(y) > params.y_miss)
-    misses = at_end & may_try & (is_uneven | ((t_even >= 0.3) & ~has_looked) | off_line)
+    misses = at_end & may_try & (is_uneven | is_blind | off_line)
     repeats = is_off | misses
     done = state.done | (at_end & ~misses) | (time > params.t_end)
     chooses = first | is_back | is_beside | repeats
-    sideways = jnp.where(is_beyond(way, 0.0) & ~is_beside, jnp.where(y > 0, 3, 1), 0)
+    room = room_of(way)
+    sideways = jnp.where((jnp.abs(y) > room) & ~is_beside, jnp.where(y > 0, 3, 1), 0)
     leg_next = jnp.where((way < s_min) & ~is_off & ~is_beside, 2, sideways)
     leg = jnp.where(chooses, leg_next, leg)
+    tries = state.tries + repeats
     psi = theta + leg * (jnp.pi / 2)
     face = planar.wrap(psi - yaw)
     turns = chooses & (jnp.abs(face) > (_TURNS if omni else 0.3))
     last_leg = leg == 0
 
     # The box from the leg, and Q9.
-    box = Box(h, known, box.centred)
-    box_in_leg, is_known, _ = box.turned(leg)
-    _, left, behind, right = box_in_leg
-    half = jnp.clip((box_in_leg[:2] + box_in_leg[2:]) / 2, *_HALF)
-    middle = (box_in_leg[:2] - box_in_leg[2:]) / 2
+    ahead, box_left, behind, box_right = _turned(h, leg)
     along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
+    middle_across, middle_along = (box_left - box_right) / 2, (ahead - behind) / 2
     wants = (leg % 2 == 0) & feels & ~chooses & (t_even > 0.6) & ~has_looked
-    wants = wants & (~last_leg | (way_left > 0.03))
-    target = jnp.where(is_known[1], -right - params.beyond, left + params.beyond)
+    wants = wants & (~last_leg | (way_left > 0.03)) & (state.t_push > 0.6)
+    knows_left = _turned(known, leg)[1]
+    target = jnp.where(knows_left, -box_right - params.beyond, box_left + params.beyond)
     look = jnp.where(wants, target, state.look)
     looking = (state.looking & ~(feels & (state.t_push > 0.5)) & ~turns) | wants
     looks = jnp.where(turns, 0.0, state.looks) + wants
-    aim_across = jnp.where(looking, look, middle[1])
+    aim_across = jnp.where(looking, look, middle_across)
     offset = aim_across - across  # [m] to the left of the base
 
     # Q7: the end of a push.
-    edge = jnp.where(t_even > 0, params.l_edge, _TURNED_EDGE)
+    edge = jnp.where(t_even > 0, params.l_edge, params.l_turn)
     is_bad = ~on_front | ((jnp.abs(offset) > edge) & (~last_leg | (way_left > 0.2)))
     t_push = jnp.where(pushing, state.t_push + jnp.where(touches, touch.period, 0.0), 0.0)
     is_lost = (t_lost > 0.6) & (state.t_push > 0)
     failed = pushing & touched & (state.t_push == 0) & ~touches & (along > _PAST - behind)
-    leaves = (touches & is_bad & (t_push > 0.2)) | is_lost | failed | turns | wants
-    leaves = pushing & touched & leaves
     # Nothing is felt there: the object lies ahead, perhaps at a dead taxel.
-    ahead_of_front = p_world_front + params.r * u - goal
-    box = Box(jnp.where(failed, grid @ ahead_of_front + params.r, h), known & ~failed, box.centred)
+    h = jnp.where(failed, grid @ (p_world_front + params.r * u - goal) + params.r, h)
     p_world_contact = jnp.where(failed, p_world_front, p_world_contact)
+    known, looking = known & ~failed, looking & ~failed
+    patience = jnp.where(looks > 0, 0.1, 0.4)
+    leaves = (touches & is_bad & (t_push > patience)) | is_lost | failed | turns | wants
+    leaves = pushing & touched & leaves
     hits = (state.mode == AROUND) & touches
     lands = hits & on_front & ~is_bad & is_facing & ~turns
     stops = hits & ~lands & (on_front | omni)
     gap = jnp.sum((p_world_contact - p_world_front) * u)
-    is_clear = (state.mode == BACK) & ((gap > params.back) | (t_lost > 2))
+    back = jnp.where((jnp.abs(face) < 0.1) & omni, 0.04, params.back)
+    at_side = omni & (jnp.abs(contact[1]) > 0.26)
+    is_clear = (state.mode == BACK) & ((gap > back) | (at_side & (t_lost > 2)))
 
     # Q8, of the base's middle or of its axle.
-    m = goal + planar.rotate(psi, jnp.stack([middle[0], aim_across]))
+    ahead_u, left_u = planar.unit(psi), planar.unit(psi + jnp.pi / 2)
+    m = goal + middle_along * ahead_u + aim_across * left_u
     p_world_axle = base - axle * u
-    R_s = half[0] + obs.front + params.gap + axle
-    R = params.R + planar.norm(half) + axle
-    circle = m, psi, p_world_axle - m, state.side, state.mode != AROUND, R, R_s
-    way_out = way_around(*circle, _CARROT if omni else _AHEAD)
-    in_front = (jnp.abs(face) < 0.1) & (along < -behind - 0.02) & (jnp.abs(offset) < 0.7)
-    is_direct = way_out.is_direct | (in_front if omni else False)
-    to_aim = jnp.where(is_direct, way_out.staging, way_out.aim) - p_world_axle
-    remaining = planar.norm(to_aim)
-    error = planar.wrap(planar.direction(-to_aim) - yaw)  # of a base in reverse
-    near = (
-        remaining < 0.02
-        if omni
-        else (remaining < 0.04) | ((remaining < 0.2) & (jnp.abs(error) > 1.2))
-    )
+    away = p_world_axle - m
+    is_short = jnp.abs(planar.wrap(psi + jnp.pi - planar.direction(away))) < 2.4
+    may_choose = (state.mode != AROUND) | (omni & is_short)
+    phi, turn, side = turn_around(psi, away, state.side, may_choose)
+    carrot = _CARROT if omni else _AHEAD
+    behind_face = omni & (jnp.abs(face) < 0.1) & (along < -behind - 0.02) & (jnp.abs(offset) < 0.7)
+    is_direct = (jnp.abs(turn) < carrot) | behind_face if omni else turn < carrot
+    half_along = jnp.clip((ahead + behind) / 2, *_HALF)
+    half_across = jnp.clip((box_left + box_right) / 2, *_HALF)
+    R_s = half_along + half_length + params.gap + axle
+    R = params.R + jnp.hypot(half_along, half_across) + axle
+    staging = m - jnp.where(behind_face, -jnp.sum(away * ahead_u), R_s) * ahead_u
+    aim = jnp.where(is_direct, staging, m + R * planar.unit(phi + side * carrot))
+    to_aim = aim - p_world_axle
+    remaining = planar.norm(staging - p_world_axle)
+    heading = planar.direction(to_aim)
+    if omni:
+        near = (remaining < 0.02) | ((remaining < 0.3) & (jnp.abs(offset) < 0.02))
+        gear, error = state.gear, face
+    else:
+        half_turns = jnp.array([0.0, jnp.pi])  # forwards and in reverse
+        errors = planar.wrap(heading + half_turns - yaw)
+        ends = jnp.abs(planar.wrap(psi - heading - half_turns))
+        costs = jnp.abs(errors) + jnp.where(is_direct, ends, jnp.pi / 2)
+        gear = jnp.where(costs[1] < costs[0] + 1.3, -1.0, 1.0)
+        gear = jnp.where(state.mode == AROUND, state.gear, gear)
+        error = jnp.where(gear > 0, *errors)
+        near = (remaining < 0.04) | ((remaining < 0.2) & (jnp.abs(error) > 1.2))
     arrives = (state.mode == AROUND) & is_direct & near
+    aligned = arrives & (jnp.abs(face) < 0.03)
 
     mode = jnp.where(is_clear, AROUND, state.mode)
-    mode = jnp.where((arrives & (jnp.abs(face) < 0.03)) | lands, PUSH, mode)
+    mode = jnp.where(aligned | lands, PUSH, mode)
     mode = jnp.where(leaves | stops, BACK, mode)
     t_push = jnp.where(mode == PUSH, t_push, 0.0)
     t_even = jnp.where(turns, 0.0, t_even)
@@ -415,49 +466,81 @@ def step(
     # Q6 and Q10.
     follows = omni & last_leg & feels & (t_even > 0.3) & has_looked & ~leaves
     d = params.r * jnp.sin(planar.wrap(yaw - theta))
-    line = jnp.where(last_leg, -(y + jnp.where(follows, d, 0.0)), 0.0)
-    lateral = soft.where(weight, line, offset)
+    lateral = soft.where(
+        weight, jnp.where(last_leg, -(y + jnp.where(follows, d, 0.0)), 0.0), offset
+    )
     steer = jnp.clip(params.K_h * lateral, -params.h_max, params.h_max)
-    turn_left = planar.wrap(psi + (jnp.where(follows, steer, 0.0) if omni else steer) - yaw)
+    steer = jnp.where(follows, steer, 0.0) if omni else steer
+    nears = touched & ~touches & (state.t_push == 0)
+    fast = jnp.where(nears, jnp.clip(-behind - along, params.v_max, params.v_free), params.v_max)
+    v = jnp.where(touched, fast, params.v_approach)
     v_last = jnp.clip(0.5 * way_left, 0.01, params.v_max)
     v_side = jnp.clip(-0.5 * beyond_line, 0.015, params.v_max)
-    slow = jnp.where(last_leg, v_last, jnp.where(leg % 2 == 1, v_side, params.v_max))
-    nears = touched & ~touches & (t_push == 0)
-    fast = jnp.where(nears, jnp.clip(-behind - along, params.v_max, params.v_free), params.v_max)
-    v = soft.where(weight, slow, jnp.where(touched, fast, params.v_approach))
-    arm = obs.front + params.r
-    curve = jnp.where(follows, jnp.clip(_CURVE * turn_left, -kappa, kappa), 0.0)
-    v = v / jnp.hypot(1.0, curve * arm)
+    slow = jnp.where(last_leg, v_last, jnp.where(leg % 2 == 1, v_side, v))
+    v = soft.where(weight, jnp.where(touched, slow, v), v)
+    turn_left = planar.wrap(psi + steer - yaw)
+    arm = half_length + params.r
+    curve = jnp.clip(params.K_e * turn_left, -kappa, kappa)
+    v = jnp.where(
+        follows,
+        jnp.minimum(v, params.v_max / jnp.hypot(1.0, curve * arm)),
+        v,
+    )
     bound = soft.where(weight, params.omega_push, params.omega_max)
-    straight = jnp.where(touched, jnp.clip(turn_left, -bound, bound), 0.0)
-    omega = jnp.where(follows, curve * v, straight)
+    omega = jnp.where(
+        follows, curve * v, jnp.where(touched, jnp.clip(turn_left, -bound, bound), 0.0)
+    )
     bound = soft.where(weight, params.slope * v, 0.4 * params.v_max)
+    gain = soft.where(weight, params.K_y, 0.5)
     may_slide = omni & touched & (touches | (t_push == 0))
-    slide = jnp.clip(soft.where(weight, params.K_y, 0.5) * lateral, -bound, bound)
-    v_y = jnp.where(may_slide, slide, 0.0) - curve * v * arm
+    v_y = jnp.where(may_slide, jnp.clip(gain * lateral, -bound, bound), 0.0)
+    v_y = v_y - jnp.where(follows, omega * arm, 0.0)
     # Q7 and Q8.
+    flee = jnp.array([-1.0, 0.0]) * params.v_free
     if omni:
-        speed = jnp.minimum(1.5, params.v_free / jnp.maximum(remaining, 1e-3))
-        drive = planar.rotate(-yaw, speed * to_aim)
+        speed = jnp.minimum(params.v_free, 1.5 * planar.norm(to_aim))
+        drive = planar.rotate(-yaw, planar.unit(heading) * speed)
         spin = 2 * face
     else:
         is_large = jnp.abs(error) > 0.6
-        v_drive = jnp.where(is_large | arrives, 0.0, -params.v_free * jnp.cos(error))
+        v_drive = jnp.where(is_large | arrives, 0.0, gear * params.v_free * jnp.cos(error))
         drive = jnp.stack([v_drive, jnp.zeros_like(v_drive)])
         spin = jnp.where(arrives, 2 * face, jnp.where(is_large, jnp.sign(error) * jnp.pi, error))
-    backs = mode == BACK
-    free_x, free_y = jnp.where(backs, jnp.array([-1.0, 0.0]) * params.v_free, drive)
-    spin = jnp.where(backs, 0.0, jnp.clip(spin, -params.omega_free, params.omega_free))
+    spin = jnp.where(mode == BACK, 0.0, jnp.clip(spin, -params.omega_free, params.omega_free))
+    free_x, free_y = jnp.where(mode == BACK, flee, drive)
     free = Twist(free_x, free_y, spin), params.v_free, params.omega_free
     push = Twist(v, v_y, omega), fast, params.omega_max
     twist, v_max, omega_max = soft.tree_where(mode == PUSH, push, free)
     v, v_y, omega = (jnp.where(done, 0.0, x) for x in twist)
-    twist = Twist(v, v_y if omni else axle * omega, omega).saturate(v_max, omega_max)
-    details = Details.from_obs(touch)._replace(gamma=face, realigning=mode != PUSH)
-    places = p_world_contact, base, yaw, jnp.stack(twist)
-    times = time, t_lost, t_push, t_even
-    search = look, looking, looks, state.tries + repeats, way_out.side
-    return PoseState(mode, leg, box, *places, touched, *times, *search, done), twist, details
+    v_y = v_y if omni else v_y + axle * omega
+    twist = Twist(v, v_y, omega).saturate(v_max, omega_max)
+    distance = planar.norm(jnp.stack([way_left, y]))
+    details = Details(offset, distance, jnp.zeros_like(distance), face, mode != PUSH)
+    memory = PoseState(
+        mode,
+        leg,
+        h,
+        known,
+        centred,
+        p_world_contact,
+        p_world_front,
+        base,
+        yaw,
+        jnp.stack(twist),
+        touched,
+        time,
+        t_lost,
+        t_push,
+        t_even,
+        look,
+        looking,
+        looks,
+        tries,
+        side,
+        gear,
+        done,
+    )
+    return memory, twist, details
 
 
 def is_done(state: PoseState) -> Array:
