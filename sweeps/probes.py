@@ -113,7 +113,9 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("ladder", "bearings", "plus", "saturation", "tuned"), ("ladder", *_TRIALS)),
     "rivals_tuned": ("ladder", "tune_es"),
     "landscape": ("wide", "hostile", "tune_es"),
-    **dict.fromkeys(("learned_test", "learned_failures", "sb3"), ("hostile", "learn")),
+    **dict.fromkeys(
+        ("learned_test", "learned_tasks", "learned_failures", "sb3"), ("hostile", "learn")
+    ),
     **dict.fromkeys(("learned_variants", "learned_continued"), ("hostile", "learn")),
     "mends": ("wide", "hostile", "tune_es"),
     **dict.fromkeys(("limits", "sizes"), ("wide", "hostile")),
@@ -127,6 +129,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
         ("arena", "commands*", "compilers*", "costs", "derivatives*", "environments*", "gpus"), ()
     ),
     **dict.fromkeys(("kernel", "levers", "robot", "speed*", "stages", "tasks_cost_*"), ()),
+    "maps": ("corridor",),
 }
 
 

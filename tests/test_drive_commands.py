@@ -58,12 +58,13 @@ def test_without_a_law_for_the_base_a_command_names_one_or_uses_it(name, drive, 
     assert not message or ("choose unicycle" in message and {"law", "laws"} & FIELDS[name])
 
 
-@pytest.mark.parametrize("drive", ROBOTS)
-def test_a_push_without_a_law_has_one_for_the_base(drive, tmp_path):
+@pytest.mark.parametrize(("drive", "law"), [("differential", "unicycle"), ("car", "unicycle_car")])
+def test_pushes_and_exports_without_a_law_have_one_for_the_base(drive, law, tmp_path):
     push = command("push", drive, tmp_path, law=False)
     push.validate()
-    assert push.case.named_law == "unicycle"
+    assert push.case.named_law == law
     assert push.configuration()["law"]["law"] == "UnicycleParams"
+    assert command("export c", drive, tmp_path, law=False).program.label == law
 
 
 def test_the_ladder_and_the_score_use_the_laws_that_the_base_can_follow():

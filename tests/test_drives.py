@@ -220,6 +220,14 @@ test_a_drive_is_refused = refusals(
 )
 
 
+@pytest.mark.parametrize("name", [k for k, x in ROBOTS.items() if x.drive != "omni"])
+def test_the_skin_of_a_robot_with_an_axle_has_no_gap_at_its_corners(name):
+    """A corner that feels nothing pushes objects away, as on the detours of `unicycle`."""
+    shell = ROBOTS[name].shell
+    lengths = [float(row.length) for row in shell.rows()]
+    np.testing.assert_allclose(lengths, 2 * np.array(shell.half)[[0, 1, 0]], rtol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["turtlebot4", "jackal", "husky", "mir100", "f1tenth"])
 def test_in_pictures_a_robot_has_its_size(name):
     robot = ROBOTS[name]

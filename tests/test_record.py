@@ -366,6 +366,16 @@ def test_an_editable_install_records_the_version_of_its_code(monkeypatch):
     assert (versions["rps_jax"], versions["jax"]) == (rps_jax.__version__, "0.0.1")
 
 
+@pytest.mark.parametrize(("content", "commit"), [("node: abc\n", "abc"), (None, None)])
+def test_an_archive_of_the_repository_knows_its_commit(content, commit, tmp_path, monkeypatch):
+    """Git replaces the format of the file in an archive."""
+    assert ".git_archival.txt export-subst" in (ROOT / ".gitattributes").read_text()
+    content = content or (ROOT / ".git_archival.txt").read_text()
+    (tmp_path / ".git_archival.txt").write_text(content)
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "rps_jax/record/provenance.py"))
+    assert provenance.git_commit.__wrapped__() == commit
+
+
 def test_paths_that_are_not_utf8_keep_their_bytes(tmp_path):
     """Python reads a snowman in a path as three lone surrogates in the C locale."""
     name = "\N{SNOWMAN}".encode().decode("ascii", errors="surrogateescape")

@@ -6,20 +6,23 @@ import time
 import warnings
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import refusal, refusing, rps, setting_of
 from numpy.random import default_rng
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from shapely import LineString, MultiLineString, MultiPoint, Point, Polygon, box
 
 import rps_jax
 from rps_jax import Observation
+from rps_jax.geometry import footprint
 from rps_jax.record import files
 from rps_jax.world import draws, points, tasks
 from rps_jax.world.domain import from_json, parse_domain, task_in_words, to_json
+from rps_jax.world.tasks.base import Positions
 from rps_jax.world.tasks.rooms import Rooms
 
 DOMAIN = "wide,objects=random_cylinder"
@@ -278,6 +281,22 @@ def test_a_path_in_a_large_map_is_clear_and_short_and_a_world_has_the_walls_near
     _, walls, drawn = world(task, 8)
     assert walls.shape == (8, 128, 2, 2)
     assert set(np.round(drawn.course.reach, 6)) == set(np.round(reach, 6))
+
+
+def test_the_room_left_in_a_large_map_has_exact_derivatives():
+    course = jax.tree.map(lambda x: jnp.asarray(x[0], float), world(hall_of_pillars())[2].course)
+    at, zero = course.path.line.vertices[1], jnp.zeros(())
+    disc = footprint.Footprint(jnp.zeros((1, 2)), jnp.asarray(0.2))
+    box = footprint.rectangle(0.2, 0.15)
+
+    def clearance(at):
+        positions = Positions(at, at, zero > 0, jnp.append(at, 0.3), box, at, zero, disc)
+        return course.step(course.start(), positions)[0].clearance
+
+    value, gradient = jax.value_and_grad(clearance)(at)
+    assert 0 < value < 1
+    assert_allclose(jnp.linalg.norm(gradient), 1, rtol=1e-5)  # towards the nearest wall
+    assert_allclose(clearance(at + 0.01 * gradient) - value, 0.01, rtol=0.05)
 
 
 def test_small_obstacles_and_what_a_crop_leaves_out_vanish(tmp_path):

@@ -224,6 +224,32 @@ def test_a_path_replaces_the_target_until_it_ends(driven):
     assert set(driven([("path", 0.01, np.nan, 0.0), *events(0.5)])[1]) == {"pushing"}
 
 
+@pytest.mark.parametrize(
+    ("law", "robot"),
+    [
+        ("rps_plus", "ideal"),
+        ("unicycle", "turtlebot4"),
+        ("unicycle_car", "f1tenth"),
+        ("pose", "ideal"),
+    ],
+)
+def test_the_node_compiles_without_a_warning(law, robot, tmp_path):
+    """With declarations of `rclcpp` in place of ROS."""
+    if shutil.which("g++") is None:
+        pytest.skip("there is no g++: run `apt-get install -y g++`")
+    node = FOLDER / "src" / "push_node.cpp"
+    for name in re.findall(r'#include "(.*/.*)"', node.read_text()):
+        stub = tmp_path / name
+        stub.parent.mkdir(parents=True, exist_ok=True)
+        if "rps_push" not in name:
+            stub.write_text(f'#include "{ROOT}/tests/ros2.hpp"\n')
+    header = tmp_path / "rps_push" / "law.h"
+    header.write_text(c.header(program.program(law, robot), "law"))
+    include = ["-I", str(tmp_path), "-I", str(FOLDER / "include")]
+    warned = ["-std=c++17", "-fsyntax-only", "-Wall", "-Wextra", "-Wconversion", "-Werror"]
+    subprocess.run(["g++", *warned, *include, str(node)], check=True)
+
+
 # --- consistency of the nodes, which need ROS to run ---------------------------------------
 
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rps_jax.control.base import remembered_object
 from rps_jax.geometry import solid
 from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import NONE
@@ -128,8 +127,8 @@ class Drawing:
             if yaw is not None:
                 self.target.wxyz = solid.quaternion(yaw)
 
-    def show(self, past: Sequence[Moment], index: int) -> None:
-        """Draw one moment, and the paths up to there."""
+    def show(self, past: Sequence[Moment], index: int, remembered: ArrayLike) -> None:
+        """Draw one moment with the `remembered` middle (2,) [m] of the object, and the paths."""
         moment = past[index]
         x, y, yaw = map(float, moment.snapshot.qpos[:3])
         self._base.position = (x, y, 0.0)
@@ -143,10 +142,10 @@ class Drawing:
         if touching:
             felt = map(float, moment.snapshot.reading.p_robot_contact)
             self._contact.position = (*felt, rendering.CONTACT_HEIGHT + 0.03)
-        middle = remembered_object(moment.trial.law_state)
-        self._remembered.visible = not np.isnan(middle).any()
+        x, y = map(float, np.asarray(remembered))
+        self._remembered.visible = not math.isnan(x)
         if self._remembered.visible:
-            self._remembered.position = (*map(float, middle), rendering.PIN[1])
+            self._remembered.position = (x, y, rendering.PIN[1])
         self._show_twist(*map(float, moment.snapshot.twist))
         way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
         self._base_path.points = _joined([m.snapshot.qpos[:2] for m in way], 0.006)

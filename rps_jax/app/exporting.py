@@ -7,12 +7,13 @@ from pathlib import Path
 
 from rps_jax.app.export import program as programs
 from rps_jax.app.export.program import Program
+from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import not_allowed
 from rps_jax.lowering.routine import identifier
 from rps_jax.record import files, folder
 from rps_jax.record.options import option
-from rps_jax.robot.robot import RobotLike
+from rps_jax.robot.robot import RobotLike, parse_robot
 from rps_jax.robot.skin import SkinLike
 from rps_jax.runs.question import Command, call_of
 from rps_jax.trials.progress import ProgressCallback
@@ -22,9 +23,10 @@ from rps_jax.trials.progress import ProgressCallback
 class Export(Command[Path]):
     """Export of a law with its parameters, and of the skin of a robot, to another language."""
 
-    law: LawLike = "rps_plus"
+    law: LawLike | None = None
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
-    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
+    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json. By default rps_plus, or the first
+    law that the robot can follow."""
     robot: RobotLike = "ideal"
     """The robot, whose boards the skin has: its name, or a JSON file of its size, boards, drive and
     limits."""
@@ -38,7 +40,10 @@ class Export(Command[Path]):
     @functools.cached_property
     def program(self) -> Program:
         """Traced law and skin."""
-        return programs.program(self.law, self.robot, self.skin)
+        law = self.law
+        if law is None:
+            law = registry.default_law(parse_robot(self.robot).drive, "rps_plus")
+        return programs.program(law, self.robot, self.skin)
 
     @property
     def named(self) -> str:

@@ -18,7 +18,6 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
-from rps_jax.control.base import mode_of, remembered_object
 from rps_jax.errors import InputError
 from rps_jax.record import files, folder
 from rps_jax.record.options import option
@@ -29,7 +28,7 @@ from rps_jax.trials import pushes, trial
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
-from rps_jax.trials.worlds import WorldBatch, rows
+from rps_jax.trials.worlds import WorldBatch, memory_of, rows
 from rps_jax.world import video
 from rps_jax.world.scene import Scene
 from rps_jax.world.video import Shot, Tile
@@ -259,11 +258,12 @@ def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, 
     moments = pushes.watch(take.part, setting, interval=interval * period, slots=take.slots)
     for trials, moment, outcomes in moments:
         contacts = np.asarray(trial.p_world_contact(moment))
-        states = [rows(trials.law_state, i) for i in range(len(ended))]
+        states = [rows((*take.part.inputs, trials.law_state), i) for i in range(len(ended))]
+        modes, objects = zip(*(memory_of(*x) for x in states), strict=True)
         times = trials.steps * period
-        status = map(_status, trials.done, trials.success, times, map(mode_of, states))
+        status = map(_status, trials.done, trials.success, times, modes)
         texts = [f"{label}\n{state}" for label, state in zip(take.labels, status, strict=True)]
-        fresh = map(Shot, moment.qpos, contacts, texts, map(remembered_object, states))
+        fresh = map(Shot, moment.qpos, contacts, texts, objects)
         # An unchanged shot is not drawn again.
         shots = [shots[i] if ended[i] else shot for i, shot in enumerate(fresh)]
         ended = trials.done

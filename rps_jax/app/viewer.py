@@ -25,7 +25,6 @@ from rps_jax import errors
 from rps_jax.app.drawing import TARGET, Drawing, furnish
 from rps_jax.app.gate import HOST, Gate, accepts_update, check_guarded
 from rps_jax.control import registry
-from rps_jax.control.base import mode_of
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.record import files
@@ -273,7 +272,7 @@ class Page:
         past, index, last = live.past, int(self._cursor), len(live.past) - 1
         with self._server.atomic():
             if self._drawn != (index, len(past)):
-                self._drawing.show(past, index)
+                self._drawing.show(past, index, live.memory_at(index).p_world_object)
                 self._drawn = index, len(past)
             worlds = past[index].worlds
             goal = (live.p_world_target, live.yaw_target)
@@ -304,7 +303,7 @@ class Page:
             way = f"{float(task['progress']):.0%} of the path, {error:.2f} m off it in the mean"
         contact = _CONTACTS[int(moment.reading.contact_type)]
         words = [f"{index * live.period:.1f} s", way, contact]
-        mode = mode_of(trial.law_state) or "realigning" * bool(moment.details.realigning)
+        mode = live.memory_at(index).mode or "realigning" * bool(moment.details.realigning)
         words += [mode] * bool(mode)
         if self._is_over(live):
             words.append("**reached**" if live.outcome.success else "**not reached**")

@@ -8,6 +8,7 @@ from typing import (
     Any,
     Generic,
     Literal,
+    NamedTuple,
     Protocol,
     TypeVar,
     runtime_checkable,
@@ -15,6 +16,7 @@ from typing import (
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rps_jax.control.observation import Details, Twist
 from rps_jax.geometry.arrays import Parameter, Pytree
@@ -29,13 +31,12 @@ from rps_jax.spec import Spec, spec_at, specs_of
 # and size (`PoseObservation`).
 Senses = Literal["touch", "taxels", "ends", "force", "pose"]
 
-# Modes of laws that reposition, by the fields of their states.
-_MODES = {
-    "retreat": "backing off",
-    "around": "driving around the object",
-    "align": "turning towards the target",
-    "away": "repositioning",
-}
+
+class Memory(NamedTuple):
+    """What pictures and the viewer show of the state of a law."""
+
+    mode: str = ""  # in words; empty in a push
+    p_world_object: ArrayLike = (np.nan, np.nan)  # (2,) [m] remembered middle; NaN: none
 
 
 @runtime_checkable
@@ -167,20 +168,10 @@ class Law(Generic[Params, State, Obs]):
     heading: bool = False
     # state -> bool: whether the law declares that it is done, which ends the trial.
     is_done: Callable[[State], jax.Array] | None = None
+    # State of one trial, and position and heading (3,) [m, m, rad] of the goal -> what is shown.
+    memory: Callable[[State, np.ndarray], Memory] = lambda state, goal: Memory()
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", tuple(dict(self.bounds).items()))  # a law is hashable
-
-
-def mode_of(state: Pytree) -> str:
-    """Return the mode in the state of one trial, in words; empty in a push or without modes."""
-    modes = (text for name, text in _MODES.items() if getattr(state, name, 0.0) > 0.5)
-    return next(modes, "")
-
-
-def remembered_object(state: Pytree) -> np.ndarray:
-    """Return the middle (2,) [m] of the object in the state of one trial; NaN without one."""
-    middle = np.asarray(getattr(state, "p_world_object", np.zeros(2)))
-    return middle if middle.any() else np.full(2, np.nan)

@@ -113,9 +113,10 @@ def law_of(params: LawParams | type) -> Law:
     return _LAWS_BY_CLASS[kind]
 
 
-def default_law(drive: DriveKind) -> str:
-    """Return the name of the law for a base with this drive, if none is named."""
-    return "rps" if drive == "omni" else laws_for(drive)[0]
+def default_law(drive: DriveKind, law: str = "rps") -> str:
+    """Return the name of a law, or of one for bases with this drive that cannot follow it."""
+    known = laws_for(drive)
+    return law if drive == "omni" else next((x for x in known if x.endswith(f"_{drive}")), known[0])
 
 
 def laws_for(drive: DriveKind) -> list[str]:

@@ -27,10 +27,11 @@ import tempfile
 import threading
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -361,7 +362,7 @@ def concurrent(
         # As a map of no vectors it has a message where it is differentiated twice.
         label = " ".join(library.name for _, library in groups)
         results = iter(linear_map(run_libraries, None, flat_inputs, [], shapes, label))
-        return [call.structure.unflatten([next(results) for _ in call.results]) for call in calls]
+        return [x.trace.structure.unflatten([next(results) for _ in x.shapes]) for x in calls]
 
     run.defjvp(lambda primals, tangents: jax.jvp(lambda *x: list(fallback(*x)), primals, tangents))
     return run
@@ -384,8 +385,41 @@ class _Library(NamedTuple):
         return self.name
 
 
+@dataclass(frozen=True)
+class Keyed:
+    """Function of one world that is traced and printed once for all functions of an equal key."""
+
+    key: Hashable
+    function: Function = field(compare=False)
+
+    def __call__(self, *arguments: Pytree) -> Pytree:
+        return self.function(*arguments)
+
+
+class _Trace:
+    """The jaxpr of a function of one world."""
+
+    def __init__(self, function: Function, tree: Pytree, types: Sequence[Pytree]) -> None:
+        self.inputs = list(itertools.starmap(jax.ShapeDtypeStruct, types))
+        with vectors.trace_one_world():
+            world = tree.unflatten(self.inputs)
+            self.jaxpr, out = jax.make_jaxpr(function, return_shape=True)(*world)
+        self.results, self.structure = jax.tree.flatten(out)
+        self.texts: dict[Pytree, str] = {}
+
+    def text(self, is_sorted: bool, printer: Callable[..., SimdWriter], *options: int) -> str:
+        """Return the text that a printer with these options writes."""
+        if (key := (is_sorted, printer, *options)) not in self.texts:
+            inputs = self.jaxpr, self.inputs, self.results, is_sorted
+            self.texts[key] = printer(*options).source(*inputs)
+        return self.texts[key]
+
+
+_trace_keyed = functools.lru_cache(256)(_Trace)
+
+
 class _Function:
-    """The jaxpr of a function of one world, and the shapes of the results of a batch."""
+    """A function of one world, and the shapes of the results of a batch."""
 
     def __init__(
         self,
@@ -394,13 +428,11 @@ class _Function:
         types: Sequence[tuple[Pytree, Pytree]],
         sort_by: Callable[..., jax.Array] | None,
     ) -> None:
-        self.inputs = [jax.ShapeDtypeStruct(shape[1:], dtype) for shape, dtype in types]
-        with vectors.trace_one_world():
-            world = tree.unflatten(self.inputs)
-            self.jaxpr, out = jax.make_jaxpr(function, return_shape=True)(*world)
-        self.results, self.structure = jax.tree.flatten(out)
+        trace: Any = _trace_keyed if isinstance(function, Keyed) else _Trace
+        self.trace = trace(function, tree, tuple((shape[1:], dtype) for shape, dtype in types))
         self.is_sorted, count = sort_by is not None, types[0][0][0]
-        self.shapes = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in self.results]
+        results = self.trace.results
+        self.shapes = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in results]
 
 
 def _compiled(functions: Sequence[_Function]) -> _Library | None:
@@ -440,14 +472,16 @@ def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
     *fewer, most = _THREADS
     for threads in fewer:
         with contextlib.suppress(TooLargeError):
-            return threads, _printed(functions, functools.partial(GpuWriter, threads))
-    return most, _printed(functions, functools.partial(GpuWriter, most))
+            return threads, _printed(functions, GpuWriter, threads)
+    return most, _printed(functions, GpuWriter, most)
 
 
-def _printed(functions: Sequence[_Function], printer: Callable[[], SimdWriter]) -> list[str]:
+def _printed(
+    functions: Sequence[_Function], printer: Callable[..., SimdWriter], *options: int
+) -> list[str]:
     """Return the texts of functions."""
     with jax.ensure_compile_time_eval():
-        return [printer().source(x.jaxpr, x.inputs, x.results, x.is_sorted) for x in functions]
+        return [x.trace.text(x.is_sorted, printer, *options) for x in functions]
 
 
 def _library(text: str, name: str) -> bytes:
@@ -473,8 +507,10 @@ def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function], wo
     Raises:
       CompilerError: the compiler fails.
     """
-    counts = [(len(x.inputs) + x.is_sorted, len(x.results)) for x in functions]
-    shapes = [(*n, *first_array(x.inputs)) for n, x in zip(counts, functions, strict=True)]
+    shapes = [
+        (len(x.trace.inputs) + x.is_sorted, len(x.shapes), *first_array(x.trace.inputs))
+        for x in functions
+    ]
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{k}.cubin" for k in range(len(texts))]
         for path, image in zip(paths, nvrtc.images(texts), strict=True):

@@ -46,13 +46,15 @@ def target() -> str | None:
 
 
 def images(texts: Sequence[str]) -> list[bytes]:
-    """Compile kernels in parallel, and return their machine code.
+    """Compile kernels in parallel, each text once, and return their machine code.
 
     Raises:
       CompilerError: NVRTC fails.
     """
-    with ThreadPoolExecutor(len(texts)) as pool:
-        return list(pool.map(_image, texts))
+    distinct = list(dict.fromkeys(texts))
+    with ThreadPoolExecutor(len(distinct)) as pool:
+        compiled = dict(zip(distinct, pool.map(_image, distinct), strict=True))
+    return [compiled[text] for text in texts]
 
 
 def _image(text: str) -> bytes:

@@ -109,7 +109,10 @@ def package_version(folder: Path) -> str:
 
 @functools.cache
 def git_commit() -> str | None:
-    """Return the git commit of the checkout of this code, marked if changed; None elsewhere."""
+    """Return the git commit of this code, in a checkout marked if changed; None if unknown.
+
+    In an archive of the repository, git has written it to `.git_archival.txt`.
+    """
     root = Path(__file__).resolve().parents[2]
     words = ("describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=-changed")
     command = ["git", "-C", str(root), *words]
@@ -117,4 +120,7 @@ def git_commit() -> str | None:
         if (root / ".git").exists():
             output = subprocess.check_output(command, stderr=subprocess.DEVNULL, timeout=10)
             return output.decode().strip()
+    with contextlib.suppress(OSError):
+        commit = (root / ".git_archival.txt").read_text().partition("node: ")[2].strip()
+        return None if "$" in commit else commit
     return None

@@ -266,10 +266,15 @@ jax.tree_util.register_dataclass(Robot, data_fields=_DATA, meta_fields=_META)
 
 
 def _covered(half_length: float, half_width: float, mass: float, **limits: Any) -> Robot:
-    """Return a robot of this outline with the paper's boards, centred on each side."""
+    """Return a robot of this outline with about the paper's boards, centred on each side.
+
+    Those of a base that cannot move sideways are stretched over the whole side. With a gap of 25 mm
+    at its corners, `turtlebot4` pushes objects away that it does not feel.
+    """
     pitch = 2 * HALF_WIDTH / 12  # of the paper's taxels
     side, front = (int(2 * half / (3 * pitch) + 1e-6) for half in (half_length, half_width))
-    sides = Boards("left", side, pitch), Boards("front", front, pitch), Boards("right", side, pitch)
+    used = None if "drive" in limits else pitch
+    sides = Boards("left", side, used), Boards("front", front, used), Boards("right", side, used)
     return Robot(half_length, half_width, sides, mass, **limits)
 
 
@@ -277,7 +282,7 @@ _ROLLERS: dict[str, Any] = {"traction": 0.5, "resistance": 0.03}  # of mecanum w
 # Of the MPO-500: four motors of 1.91 N m at most, geared 25:1, on wheels of 254 mm.
 _GEARED_MOTORS = {"force_max": 1504.0, "torque_max": 558.0} | _ROLLERS
 # From data sheets and the makers' robot descriptions, where these give a number. None of these has
-# a skin: they get the paper's boards.
+# a skin: they get about the paper's boards.
 ROBOTS: dict[str, Robot] = {
     # Follows every twist at once, as in the paper's simulation.
     "ideal": Robot(),

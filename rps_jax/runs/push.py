@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from rps_jax import errors
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
-from rps_jax.control.base import Law, LawParams, Senses, mode_of, remembered_object
+from rps_jax.control.base import Law, LawParams, Senses
 from rps_jax.control.observation import Twist
 from rps_jax.engines import device
 from rps_jax.errors import InputError
@@ -49,7 +49,7 @@ from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, object_pose, p_world_contact
-from rps_jax.trials.worlds import WorldBatch, rows
+from rps_jax.trials.worlds import WorldBatch, memory_of, rows
 from rps_jax.world import paper, tasks
 from rps_jax.world.scene import Scene
 
@@ -166,9 +166,10 @@ class Trace(Trajectory):
         shown = _evenly_spaced(len(self.snapshots.time), round(seconds * fps))
         contacts = np.asarray(p_world_contact(self.snapshots))[shown]
         states = [rows(self.law_states, i) for i in shown]
+        memories = (memory_of(self.world, self.params, state) for state in states)
         poses = watch(self.snapshots.qpos[shown])
-        marks = map(mode_of, states), map(remembered_object, states)
-        shots = ([video.Shot(*shot)] for shot in zip(poses, contacts, *marks, strict=True))
+        marks = zip(poses, contacts, memories, strict=True)
+        shots = ([video.Shot(qpos, at, *memory)] for qpos, at, memory in marks)
         video.render([self._tile], shots, Path(path), fps=fps, size=size)
         return Path(path)
 

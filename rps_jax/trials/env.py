@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -295,6 +295,13 @@ class PushEnv:
     def is_native(self) -> bool:
         """Whether `engines.native` can compile its functions of one world."""
         return native.compiles(self._batch.stage)
+
+    @property
+    def program(self) -> Hashable:
+        """Key of all but the worlds' fields on which `begin` and `step` depend."""
+        setting = self.setting
+        loop = setting.simulator.name, setting.physics, setting.rules, self._batch.stage
+        return *loop, self._alone.robot.drive, self.params, self.weights, self.smooth, self.senses
 
     @property
     def dt(self) -> float:

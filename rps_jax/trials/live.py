@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import engines, errors
-from rps_jax.control.base import LawParams
+from rps_jax.control.base import LawParams, Memory
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin, Skin
 from rps_jax.trials import trial
 from rps_jax.trials.batch import stepper
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
-from rps_jax.trials.worlds import WorldBatch, rows
+from rps_jax.trials.worlds import WorldBatch, memory_of, rows
 from rps_jax.world.tasks.base import heading_of
 
 CHUNK = 25  # steps, at most, between two checks of the clock
@@ -90,6 +90,11 @@ class Live:
     def lines(self) -> dict[str, np.ndarray]:
         """Lines of the task for pictures: see `Course.lines`."""
         return rows(self._worlds.task, 0).lines()
+
+    def memory_at(self, index: int) -> Memory:
+        """Return what the law remembers before a step of `past`."""
+        worlds, state = self.past[index].worlds, self.past[index].trial.law_state
+        return memory_of(*rows((worlds, self._params), 0), state)
 
     # --- control ---
 

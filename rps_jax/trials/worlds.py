@@ -19,7 +19,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import registry
-from rps_jax.control.base import Law, LawParams
+from rps_jax.control.base import Law, LawParams, Memory
 from rps_jax.geometry import solid
 from rps_jax.geometry.arrays import Pytree
 from rps_jax.geometry.footprint import Footprint
@@ -35,6 +35,7 @@ from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.points import Points
 from rps_jax.world.scene import JOINTS, Friction, Scene, WorldInputs
+from rps_jax.world.tasks.base import heading_of
 
 Tree = TypeVar("Tree")  # a pytree
 Inputs = tuple[World, LawParams]
@@ -89,6 +90,13 @@ class WorldBatch(NamedTuple):
         parts = slice(count), slice(count, None)
         first, rest = (rows(arrays, part)._replace(stage=self.stage) for part in parts)
         return first, rest if rest.indices.size else None
+
+
+def memory_of(world: World, params: LawParams, state: Pytree) -> Memory:
+    """Return what the law with a state remembers in a world, for pictures."""
+    target, heading = np.asarray(world.p_world_target, float), heading_of(world.task)
+    yaw = np.arctan2(target[1], target[0]) if heading is None else float(heading)
+    return registry.law_of(params).memory(state, np.append(target, yaw))
 
 
 class Job(NamedTuple):

@@ -119,10 +119,16 @@ def ease(world: World, level: jax.Array) -> World:
 
 
 def _together(
-    envs: Sequence[PushEnv], function: Callable[..., T], inputs: Sequence[tuple[PyTree, ...]]
+    envs: Sequence[PushEnv],
+    network: Network,
+    function: Callable[..., T],
+    inputs: Sequence[tuple[PyTree, ...]],
 ) -> list[T]:
-    """Map `function(env, ...)` of one world over the inputs (N, ...) of each environment."""
-    functions = [partial(function, env) for env in envs]
+    """Map `function(network, env, ...)` of one world over inputs (N, ...) of each environment."""
+    functions = [
+        native.Keyed((function, network, env.program), partial(function, network, env))
+        for env in envs
+    ]
 
     def in_xla(*inputs: tuple[PyTree, ...]) -> list[T]:
         return [jax.vmap(f)(*x) for f, x in zip(functions, inputs, strict=True)]
@@ -135,17 +141,18 @@ def _begin(
     network: Network, envs: Sequence[PushEnv], draws: Sequence[tuple[World, jax.Array]]
 ) -> list[EnvBatch]:
     """Return worlds (N, ...) of indices (N,) at their start, after the first observation."""
-
-    def begin(env: PushEnv, world: World, index: jax.Array) -> EnvBatch:
-        state = env.begin(world, index)
-        memory = PolicyState.init(network, state.obs.dtype)
-        touch_state = memory.touch_state.update(state.info["observation"])
-        state = state.replace(info=state.info | {"world": None})
-        memory = memory._replace(touch_state=touch_state)
-        return EnvBatch(state, memory, jnp.ones((), bool), jnp.zeros(()))
-
-    batches = _together(envs, begin, draws)
+    batches = _together(envs, network, _begin_world, draws)
     return [_with_info(x, world=draw[0]) for x, draw in zip(batches, draws, strict=True)]
+
+
+def _begin_world(network: Network, env: PushEnv, world: World, index: jax.Array) -> EnvBatch:
+    """Return one world at its start, without the fields that do not change."""
+    state = env.begin(world, index)
+    memory = PolicyState.init(network, state.obs.dtype)
+    touch_state = memory.touch_state.update(state.info["observation"])
+    state = state.replace(info=state.info | {"world": None})
+    memory = memory._replace(touch_state=touch_state)
+    return EnvBatch(state, memory, jnp.ones((), bool), jnp.zeros(()))
 
 
 def _with_info(batch: EnvBatch, **info: PyTree) -> EnvBatch:
@@ -213,6 +220,7 @@ def _privileged(env: PushEnv, state: State) -> Privileged:
         tilt_ahead,
         tilt_left,
         world.qpos[JOINTS.object_height],
+        jnp.minimum(getattr(data.task, "measured", 1.0), 1.0),
     )
 
 
@@ -222,6 +230,28 @@ def _inputs(env: PushEnv, batch: EnvBatch) -> Pair:
     inputs = jax.vmap(features.compute_features)(memory.touch_state, memory.action, obs)
     privileged = jax.vmap(lambda state: jnp.stack(_privileged(env, state)))(batch.states)
     return inputs, privileged
+
+
+def _act(
+    network: Network, env: PushEnv, batch: EnvBatch, _: jax.Array, action: jax.Array
+) -> tuple[EnvBatch, jax.Array]:
+    """Execute an action (A,) in one world; the kernel does not copy constant fields."""
+    bounded = features.clip_action(action)
+    command = bounded if network.actions == 3 else bounded[::2]  # v_x and omega
+    touch_state = batch.memory.touch_state.mark_decision(batch.states.info["observation"])
+
+    def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
+        state, touch_state, reward = carry
+        state = env.step(state, command)
+        touch_state = touch_state.update(state.info["observation"])
+        return (state, touch_state, reward + state.reward), None
+
+    carry = batch.states, touch_state, jnp.zeros_like(batch.earned)
+    steps = round(network.hold / env.dt)
+    state, touch_state, reward = jax.lax.scan(step, carry, length=steps)[0]
+    memory = batch.memory._replace(touch_state=touch_state, hidden=jnp.zeros(()), action=bounded)
+    moved = EnvBatch(state, memory, jnp.zeros_like(batch.first), batch.earned + reward)
+    return _with_info(moved, world=None), reward
 
 
 def _act_together(
@@ -236,35 +266,11 @@ def _act_together(
     Returns:
       The batch of each environment and the rewards (N,).
     """
-
-    def act(
-        env: PushEnv, batch: EnvBatch, _: jax.Array, action: jax.Array
-    ) -> tuple[EnvBatch, jax.Array]:
-        """Execute an action (A,) in one world; the kernel does not copy constant fields."""
-        bounded = features.clip_action(action)
-        command = bounded if network.actions == 3 else bounded[::2]  # v_x and omega
-        touch_state = batch.memory.touch_state.mark_decision(batch.states.info["observation"])
-
-        def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
-            state, touch_state, reward = carry
-            state = env.step(state, command)
-            touch_state = touch_state.update(state.info["observation"])
-            return (state, touch_state, reward + state.reward), None
-
-        carry = batch.states, touch_state, jnp.zeros_like(batch.earned)
-        steps = round(network.hold / env.dt)
-        state, touch_state, reward = jax.lax.scan(step, carry, length=steps)[0]
-        memory = batch.memory._replace(
-            touch_state=touch_state, hidden=jnp.zeros(()), action=bounded
-        )
-        moved = EnvBatch(state, memory, jnp.zeros_like(batch.first), batch.earned + reward)
-        return _with_info(moved, world=None), reward
-
     splits = np.cumsum([x.first.size for x in batches])[:-1]
     inputs = list(zip(batches, jnp.split(hidden, splits), jnp.split(action, splits), strict=True))
     results = []
     for (batch, reward), (old, new_hidden, _) in zip(
-        _together(envs, act, inputs), inputs, strict=True
+        _together(envs, network, _act, inputs), inputs, strict=True
     ):
         memory = batch.memory._replace(hidden=new_hidden)
         batch = _with_info(batch._replace(memory=memory), world=old.states.info["world"])

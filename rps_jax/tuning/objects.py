@@ -62,6 +62,7 @@ PRIOR: Mapping[str, tuple[float, float]] = {
 }
 _OFFSETS = {"camera_x": "m", "camera_y": "m", "marker_x": "m", "marker_y": "m", "marker_yaw": "rad"}
 _GAP = 2e-4  # [m] standard deviation of gaps
+_LOSS = 1e-3, 0.05  # scale of Cauchy's loss: [m], and share of the motion of the object
 _APART = 1e-3  # [m] gap at the end of a push whose finger no longer touches
 _MOST_GAP = 5e-4  # [m] median gap at the end that a fit leaves, at most
 _FOOT = 1e-3  # [m] radius of a known foot
@@ -340,18 +341,22 @@ def fit(
         rule = f"it starts {-1e3 * first[i, 0]:.1f} mm inside the object; check outline and units"
         raise errors.not_allowed("pushes", f"push {i}", rule)
 
+    turn = size * solid.wrap(data.end[:, 2] - data.start[:, 2])
+    way = np.linalg.norm(data.end[:, :2] - data.start[:, :2], axis=1)
+    unit = _LOSS[0] + _LOSS[1] * np.nan_to_num(np.abs(np.stack([way, way, turn], axis=1)))
+
     def residuals(z: np.ndarray) -> np.ndarray:
         """Return robust residuals of poses and gaps, and those of the priors."""
         pose, gap = _batched(_simulate, mean + deviation * z, fixed, data)
         off = pose - data.end
         off[:, 2] = size * solid.wrap(off[:, 2])
-        rows = np.append(off / _UNIT, gap[:, :2].T / _GAP)
+        rows = np.append(off / unit, gap[:, :2].T / _GAP)
         return np.append(np.nan_to_num(np.sign(rows) * np.sqrt(np.log1p(rows**2))), z)
 
     def slopes(z: np.ndarray) -> np.ndarray:
         x, robust = mean + deviation * z, residuals(z)[: -len(z)]
         pose, gap = _batched(_derivatives, x, fixed, data)
-        pose = pose / _UNIT * np.array([1, 1, size])[:, None]
+        pose = pose / unit[:, :, None] * np.array([1, 1, size])[:, None]
         rows = np.concatenate([pose.reshape(-1, len(z)), *gap[:, :2].swapaxes(0, 1) / _GAP])
         # Derivative of Cauchy's root loss g = sqrt(log(1 + r^2)), with r^2 = exp(g^2) - 1.
         square = np.expm1(robust**2)
@@ -422,9 +427,6 @@ def _calibrated(fitted: ObjectFit, data: Pushes) -> ObjectFit:
     share = count / (count + _PSEUDO)
     quantile = {name: (1 - share) * _QUANTILE[name] + share * own[name] for name in own}
     return replace(fitted, quantile=quantile, nearby=(traits, weight))
-
-
-_UNIT = 1e-3  # [m] scale of Cauchy's loss
 
 
 @dataclass(frozen=True)

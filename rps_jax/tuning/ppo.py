@@ -40,6 +40,7 @@ class Privileged(NamedTuple):
     tilt_ahead: jax.Array  # [1] of the object's axis, three times its component
     tilt_left: jax.Array  # [1]
     height: jax.Array  # [m] of the object's centre at the start
+    room: jax.Array  # [m] between base or object and the nearest wall, within 1 m
 
 
 _MIRRORED = ("left", "tilt_left")  # they change their signs in the mirror image

@@ -4,6 +4,7 @@ A custom object has an MJCF file with its visual geoms and mass, and a footprint
 use the upright solid over the footprint, in all engines.
 """
 
+import functools
 import math
 import os
 from collections.abc import Iterable, Sequence
@@ -83,6 +84,7 @@ def path_of(name: str) -> Path:
     return REGISTERED[name].path if name in REGISTERED else mjcf_folder() / f"{name}.xml"
 
 
+@functools.cache
 def guesses_of(name: str) -> np.ndarray | None:
     """Return the ranges (4, 2) of depth, breadth, height [m] and mass [kg] that a file guesses.
 
@@ -261,6 +263,7 @@ def register_object(
     single = solid_of_body(body, vertices, radius, _height(label, model))
     REGISTERED[name] = Registered(path, single._replace(feet=feet, pads=pads))
     FAMILIES[name] = family
+    guesses_of.cache_clear()
     guesses_of(name)
 
 

@@ -69,17 +69,13 @@ class Costs(SpeedStudy[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Measure all tasks in turn, round by round."""
         setting = Setting("fused", rules=Rules(horizon=self.horizon, max_lost=1e4))
-        params = jax.tree.map(lambda x: np.asarray(x)[None], resolve_law("rps")[1])
         costs = np.zeros((len(self.tasks), self.rounds + 1))
         for i in range(self.rounds + 1):
             for j, name in enumerate(self.tasks):
-                request = Candidates(params, [domain_of(TASKS[name])], 0, np.arange(self.worlds))
-                start = time.process_time()
-                _, timing = outcomes([request], setting, workers=self.workers)
-                used = time.process_time() - start if kind_of_device() == "cpu" else timing.run
-                costs[j, i] = used / timing.simulated
+                inputs = domain_of(TASKS[name]), setting, self.worlds
+                costs[j, i] = cost_of(*inputs, self.workers)
                 done = (i * len(self.tasks) + j + 1) * self.worlds
-                run.callback(Progress(done, timing.simulated))
+                run.callback(Progress(done, done * self.horizon))
         cost = (("task", "round"), costs[:, 1:], {"units": "1"})
         return xr.Dataset({"cost": cost}, {"task": list(self.tasks)})
 
@@ -95,6 +91,16 @@ class Costs(SpeedStudy[xr.Dataset]):
 
 
 costs = call_of(Costs)
+
+
+def cost_of(domain: Domain, setting: Setting, worlds: int, workers: int = 1) -> float:
+    """Return the time [s] of a simulated second of `rps` in worlds of a domain."""
+    params = jax.tree.map(lambda x: np.asarray(x)[None], resolve_law("rps")[1])
+    start = time.process_time()
+    inputs = [Candidates(params, [domain], 0, np.arange(worlds))]
+    _, timing = outcomes(inputs, setting, workers=workers)
+    used = time.process_time() - start if kind_of_device() == "cpu" else timing.run
+    return used / timing.simulated
 
 
 def domain_of(task: str) -> Domain:

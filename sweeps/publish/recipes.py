@@ -54,6 +54,13 @@ _IDEAL = (
     "wide,skin=ideal,pose_noise=0:0,yaw_noise=0:0,pose_latency=0:0,command_delay=0:0,"
     "velocity_error=0:0"
 )
+_CORRIDOR = "--domain wide --horizon 600 --task corridor,length=10,lookahead=0.95"
+_BETWEEN_WALLS = {
+    "corridors of 1.1 to 1.6 m, turns of 45°": f"{_CORRIDOR},width=1.1:1.6,turn_angle=0.785:0.786"
+    " --worlds 1500",
+    "corridors of 1.1 to 2.5 m": f"{_CORRIDOR},width=1.1:2.5,turn_angle=0:1.57 --worlds 3000",
+    **{f"`{name}`": f"--domain {name} --worlds 10000" for name in ("hostile", "real", "wide")},
+}
 _PLUS = {
     "`wide`, 10,000": "rps ladder --domain wide --worlds 10000 --seed 10 --laws rps_plus rps_tuned",
     "`wide` in C MuJoCo, 500": "rps ladder --domain wide --worlds 500 --seed 11 --engine mujoco "
@@ -352,6 +359,7 @@ RECIPES: dict[str, Recipe] = {
     "tasks_cost_gpu": recipe(
         f"rps sweeps/corridors/costs.py --worlds 16384 --rounds 6 {_MACHINE}", gpu=2
     ),
+    "maps": recipe(f"rps sweeps/corridors/maps.py --data FOLDER {_MACHINE}", cores=10),
     "force_push_paths": recipe(f"rps sweeps/force_push_grid/paths.py {_MACHINE}", cores=60, gpu=2),
     "tuned_for_corridors": recipe(
         "rps ladder --laws rps_tuned rps_tuned,sweeps/corridors/tuned.json --domain wide real "
@@ -389,8 +397,15 @@ RECIPES: dict[str, Recipe] = {
         cores=60,
     ),
     "sb3": recipe(f"rps sweeps/learned/sb3.py {_MACHINE}", cores=3),
-    "learned_test": recipe(
-        *_LEARNED, gpu=4, section=rows.learned_beside_plus, labels=(*_WIDE, "real")
+    "learned_test": recipe(*_LEARNED, gpu=4, section=rows.beside_first, labels=(*_WIDE, "real")),
+    "learned_tasks": recipe(
+        *(
+            f"rps sweep {options} --seed 7301 --laws learned sweeps/learned/learned_tasks.npz"
+            for options in _BETWEEN_WALLS.values()
+        ),
+        cores=20,
+        section=rows.beside_first,
+        labels=tuple(_BETWEEN_WALLS),
     ),
     "learned_failures": recipe(
         *_LEARNED[1:],

@@ -91,9 +91,10 @@ def plus_beside_tuned(results: xr.Dataset) -> Rows:
     return _beside(results, ("rps_plus", "rps_tuned"), "rps_tuned")
 
 
-def learned_beside_plus(results: xr.Dataset) -> Rows:
-    """Return a header and the rows of all laws of a sweep, world by world against RPS+."""
-    return _beside(results, results.law.values.tolist(), "rps_plus")
+def beside_first(results: xr.Dataset) -> Rows:
+    """Return a header and the rows of all laws of a sweep, world by world against the first."""
+    names = results.law.values.tolist()
+    return _beside(results, names, names[0])
 
 
 def _beside(results: xr.Dataset, laws: Sequence[str], base: str) -> Rows:

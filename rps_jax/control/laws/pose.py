@@ -56,13 +56,22 @@ from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SpeedMax, SuccessDistance, bounds_of
-from rps_jax.control.laws.unicycle import contact_of, turn_around
+from rps_jax.control.base import (
+    ApproachSpeed,
+    Law,
+    Memory,
+    OmegaMax,
+    SpeedMax,
+    SuccessDistance,
+    bounds_of,
+)
+from rps_jax.control.laws.unicycle import MODES, contact_of, turn_around
 from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
-from rps_jax.geometry import planar
+from rps_jax.geometry import planar, solid
 from rps_jax.geometry.arrays import Array, Parameter
 from rps_jax.spec import Bound, Spec, document
 
@@ -548,6 +557,15 @@ def is_done(state: PoseState) -> Array:
     return state.done
 
 
+def memory(state: PoseState, goal: np.ndarray) -> Memory:
+    """Return the mode and the middle of the box."""
+    mode = ("", *MODES[:2])[int(state.mode)]
+    ahead, left, behind, right = state.h
+    middle = np.array([ahead - behind, left - right]) / 2
+    middle = goal[:2] + solid.rotate(goal[2:], middle[None])[0]
+    return Memory(mode, middle) if state.touched else Memory(mode)
+
+
 LAW = Law(
     init,
     step,
@@ -560,6 +578,7 @@ LAW = Law(
     temperatures=Smooth(),
     is_done=is_done,
     observe_sent=observe_sent,
+    memory=memory,
 )
 PRESETS = {
     "pose": PoseParams(),

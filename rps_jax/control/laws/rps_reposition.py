@@ -18,10 +18,11 @@ from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import Law, bounds_of, nested_bounds
+from rps_jax.control.base import Law, Memory, bounds_of, nested_bounds
 from rps_jax.control.laws import rps_plus, unicycle
 from rps_jax.control.laws.rps_plus import RPSPlusParams, RPSPlusState
 from rps_jax.control.observation import Details, Observation, Twist
@@ -137,8 +138,15 @@ def step(
     return memory, twist, details
 
 
+def memory(state: RPSRepositionState, goal: np.ndarray) -> Memory:
+    """Return whether the base repositions, and the middle M of the object."""
+    del goal
+    mode = "repositioning" * bool(state.away)
+    return Memory(mode, state.p_world_object) if state.law.law.touched else Memory(mode)
+
+
 BOUNDS = nested_bounds("law", rps_plus.BOUNDS) | dict(bounds_of(RPSRepositionParams))
-LAW = Law(init, step, check=check, bounds=BOUNDS, room=1.5)
+LAW = Law(init, step, check=check, bounds=BOUNDS, room=1.5, memory=memory)
 PRESETS = {
     "rps_reposition": RPSRepositionParams(),  # tuned in `hostile`
     "rps_reposition_round": RPSRepositionParams(  # tuned in `wide` with a round base

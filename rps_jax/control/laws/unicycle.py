@@ -48,16 +48,18 @@ from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SuccessDistance, bounds_of
+from rps_jax.control.base import ApproachSpeed, Law, Memory, OmegaMax, SuccessDistance, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number, Parameter
 from rps_jax.robot.shell import HALF_LENGTH
 from rps_jax.spec import Bound, Spec, document
 
+MODES = "backing off", "driving around the object", "turning towards the target"
 _SIDE = 0.02  # [m] behind the front, where a contact is on a side
 _ROUND_SIDE = 1.2  # [rad] from the front of a round base
 _LARGE = 0.5  # [rad] heading error above which the base turns on the spot
@@ -348,6 +350,15 @@ def step(
     return memory, Twist(v, axle * omega, omega), details
 
 
+def memory(state: UnicycleState, goal: np.ndarray) -> Memory:
+    """Return the mode and the middle M of the object."""
+    del goal
+    weights = state.retreat, state.around, state.align
+    modes = zip(weights, MODES, strict=True)
+    mode = next((words for weight, words in modes if weight > 0.5), "")
+    return Memory(mode, state.p_world_object) if state.touched > 0.5 else Memory(mode)
+
+
 LAW = Law(
     init,
     step,
@@ -356,6 +367,7 @@ LAW = Law(
     temperatures=Widths(),
     drives=("omni", "differential", "car"),
     room=1.0,
+    memory=memory,
 )
 _TUNED = UnicycleParams()
 PRESETS = {

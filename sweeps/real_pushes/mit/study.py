@@ -13,9 +13,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import multiprocessing
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,6 +29,7 @@ from scipy.io import loadmat
 from scipy.optimize import linear_sum_assignment
 
 from rps_jax import InputError, fit_object
+from rps_jax.engines import device
 from rps_jax.questions import Run, call_of, option
 from rps_jax.tuning import objects
 from rps_jax.tuning.objects import PRIOR, Pushes
@@ -58,10 +61,8 @@ CELLS = (
 )
 # Shapes on which nothing was developed.
 UNSEEN = ("rect3", "tri1", "ellip3")
-_PRESSURES = list(PRIOR).index("camera_x")  # parameters of friction and pressure, the first ones
 _INSIDE = 4e-3  # [m] of the finger in the object at the start of a broken record
 _PUSHES = 700  # of a cell, at most
-_THREADS = 2
 METHODS = (
     "best published",
     "5 pushes",
@@ -199,7 +200,7 @@ class Mit(QuickStudy[xr.Dataset]):
     """Folder with a clone of the repository."""
     cells: tuple[str, ...] = CELLS
     """Surface, object and speed [mm/s]; by default all."""
-    draws: int = option(2, 1, 100)
+    draws: int = option(10, 1, 100)
     """Number of random choices of the pushes to which objects are fitted."""
 
     def check(self) -> None:
@@ -209,16 +210,20 @@ class Mit(QuickStudy[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Fit each cell to 20 % of its pushes, and then to few with the prior of the others."""
-        with ThreadPoolExecutor(_THREADS) as pool:
+        cores = len(os.sched_getaffinity(0))
+        context, choose = multiprocessing.get_context("spawn"), partial(device.choose, "cpu")
+        processes = ProcessPoolExecutor(cores, context, choose)
+        with processes, ThreadPoolExecutor(2 * cores) as threads:
 
             def parts_of(kind: str, compute: Callable[[str], xr.Dataset]) -> list[xr.Dataset]:
                 def part(cell: str) -> xr.Dataset:
-                    return run.checkpoint(f"{kind}_{part_name(cell)}", partial(compute, cell))
+                    task = lambda: processes.submit(compute, cell).result()  # noqa: E731
+                    return run.checkpoint(f"{kind}_{part_name(cell)}", task)
 
-                return list(pool.map(part, self.cells))
+                return list(threads.map(part, self.cells))
 
             shares = dict(zip(self.cells, parts_of("share", self._share), strict=True))
-            by_cell = parts_of("few", lambda cell: self._few(cell, shares))
+            by_cell = parts_of("few", partial(self._few, shares=shares))
         cells = xr.IndexVariable("cell", list(self.cells))
         means = xr.concat(shares.values(), cells)[["mean"]]
         return _scaled(xr.merge([xr.concat(by_cell, cells), means]))
@@ -257,7 +262,9 @@ class Mit(QuickStudy[xr.Dataset]):
         if len(others) > 1:
             means = np.array([shares[x]["mean"].values for x in others])
             deviation = np.array([*PRIOR.values()])[:, 1]
-            least = np.where(np.arange(len(PRIOR)) < _PRESSURES, 0.3, 1.0)  # offsets are of a cell
+            # Offsets of markers are of a cell, and those of the camera of a sheet.
+            is_marker = np.char.startswith(list(PRIOR), "marker")
+            least = np.where(is_marker, 1.0, 0.3)
             spread = np.maximum(means.std(axis=0, ddof=1), least * deviation)
             prior = dict(zip(PRIOR, zip(means.mean(axis=0), spread, strict=True), strict=True))
         by_method = []
