@@ -44,11 +44,10 @@ the half width w on its corners follows up to the curvature w / (w^2 + depth^2),
       theta - K_h c_G within h_max:  omega = v clip(K_e (heading - yaw), +-kappa),
       v_y = -omega (r + the distance of the front)
 
-Without contact v_free and omega_free are the bounds; the base nears the box at its distance
-times 1 / s. A base that cannot move sideways steers in Q6:
-omega towards the leg + K_h c, within h_max; in Q8 it drives forwards or in reverse. The law needs a
-flat front. In its smooth form the contact is a weight that mixes the twists of Q6; modes and legs
-switch.
+Without contact v_free and omega_free are the bounds; the base nears the box at its distance times
+1 / s. A base that cannot move sideways steers in Q6: omega towards the leg + K_h c, within h_max;
+in Q8 it drives forwards or in reverse. The law needs a flat front. In its smooth form the contact
+is a weight that mixes the twists of Q6; modes and legs switch.
 """
 
 from functools import partial
