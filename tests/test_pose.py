@@ -1,6 +1,7 @@
 """Goals with a heading: the task, the sense of ends, and the law."""
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,8 +14,10 @@ from numpy.testing import assert_allclose
 import rps_jax
 from rps_jax import Details, Law, Twist
 from rps_jax.control import registry
-from rps_jax.control.laws.pose import PoseParams
+from rps_jax.control.laws.pose import Box, PoseParams, feel
 from rps_jax.control.observation import EndsObservation, Observation
+from rps_jax.engines.base import ControlPeriod, Motion
+from rps_jax.engines.quasistatic import Quasistatic, Slider
 from rps_jax.geometry import footprint as fp
 from rps_jax.robot import skin as skins
 from rps_jax.robot.shell import Shell
@@ -22,6 +25,7 @@ from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.world.physics import Physics
 from rps_jax.world.tasks import parse_task
 from rps_jax.world.tasks.base import Positions
 from rps_jax.world.tasks.pose import PoseCourse
@@ -151,6 +155,8 @@ CASES = {
     "push --task pose,yaw_success=0": "task yaw_success = 0",
     "push --task pose --target 0.6 0.1": r"target = \(0.6, 0.1\) m is not allowed: the object st",
     "push --task pose,yaw=1": "unknown task quantity of pose 'yaw'",
+    "push --task path,heading=1": "unknown task quantity of path 'heading'",
+    "push --task rooms,goal=4:2:1": r"task goal = \[4.0, 2.0, 1.0\] is not allowed: write pairs",
     "push --law pose,v_free=0": "v_free = 0",
     "push --law pose --robot f1tenth": "law = pose is not allowed",
 }
@@ -282,6 +288,73 @@ def test_a_flush_face_turns_about_a_point_beside_the_middle_of_the_box():
         assert abs(omega / v_x) < sharpest + 1e-5
         assert math.hypot(v_x, v_y) < 0.05 + 1e-6
     assert omega / v_x == pytest.approx(sharpest, rel=1e-4)
+
+
+def relative_turn(half_depth, half_width, curvature, friction=0.0, way=0.25):
+    """Return the turn (n,) [rad] of boxes on their corners from a front that follows a curve.
+
+    They start flush, and the base turns about a point beside the middle of the box.
+    """
+    count, front, speed = half_width.size, 0.3625, 0.05
+    a, b = half_depth, half_width
+    corners = np.stack([[-a, -b], [a, -b], [a, b], [-a, b]], axis=0).transpose(2, 0, 1)
+    full = partial(np.full, count)
+    slider = Slider(
+        np.zeros((count, 2)),
+        np.hypot(a, b),
+        full(friction),
+        np.tile([front, 0.29], (count, 1)),
+        corners,
+        np.zeros(count),
+    )
+    qpos = np.zeros((count, 10))
+    qpos[:, 3], qpos[:, 6] = front + a, 1
+    omega = speed * curvature
+    twist = Twist(full(speed), -omega * (front + a), omega)
+    start = Motion(*(jnp.asarray(x) for x in (qpos, np.zeros((count, 9)), np.zeros((count, 9)))))
+
+    @jax.jit
+    def drive(motion):
+        period = ControlPeriod(jax.tree.map(jnp.asarray, twist), Physics())
+        step = lambda _, m: Quasistatic().drive(slider, m, period).motion  # noqa: E731
+        return jax.lax.fori_loop(0, round(way / speed / Physics().control_period), step, motion)
+
+    end = drive(start).qpos
+    return np.asarray(2 * jnp.arctan2(end[:, 9], end[:, 6]) - end[:, 2])
+
+
+def test_a_face_stays_flush_up_to_the_limit_of_the_curvature_and_not_beyond():
+    """Q10 in drawn boxes; friction at the front does not raise it."""
+    rng = np.random.default_rng(5)
+    half_depth, half_width = rng.uniform(0.07, 0.5, 64), rng.uniform(0.07, 0.29, 64)
+    limit = half_width / (half_width**2 + half_depth**2) * rng.choice([-1, 1], 64)
+    for friction in (0.0, 0.4):
+        below, beyond = (
+            relative_turn(half_depth, half_width, share * limit, friction) * np.sign(limit)
+            for share in (0.9, 1.1)
+        )
+        assert_allclose(below, 0, atol=4e-3)
+        assert (beyond < -4e-3).all()
+
+
+def felt(box, lateral, ends, seen, t_even=1.0):
+    """Return the supports of a box (4,) after an even contact on its face."""
+    touch = Observation(*(jnp.zeros(2), jnp.zeros(()), jnp.zeros(2), ~NO, jnp.zeros(2)))
+    signals = jnp.zeros(42), jnp.ones(42, bool)
+    obs = EndsObservation(touch, *signals, jnp.array(ends), jnp.array(seen), ~NO, jnp.asarray(0.36))
+    inputs = jnp.asarray(-0.5), jnp.asarray(lateral), obs, jnp.asarray(t_even)
+    return feel(PoseParams(), box, *inputs)
+
+
+def test_a_side_reaches_as_far_as_it_was_felt_until_its_end_is_seen():
+    box = Box(jnp.array([0.3, 0.5, 0.5, 0.5]), jnp.zeros(4, bool), jnp.zeros(2, bool))
+    for lateral, right in ((0.0, 0.29), (-0.3, 0.59), (0.1, 0.59)):
+        box = felt(box, lateral, (0.29, -0.29), (False, False))
+        assert box.h[3] == pytest.approx(right)
+        assert not box.known[3]
+    box = felt(box, -0.6, (0.29, -0.1), (False, True))
+    assert box.h[3] == pytest.approx(0.7)
+    assert box.known.tolist() == [False, False, True, True]
 
 
 def test_a_contact_around_both_corners_of_the_front_is_a_push():

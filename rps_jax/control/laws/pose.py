@@ -12,9 +12,9 @@ offsets e_left and e_right of the ends of an even contact:
 
   Q1  h_(k+2) = -(F - T) . d_k,  the pushed face
   Q2  h_(k+1) = (P - T) . d_(k+1) + e_left  and  h_(k+3) = -(P - T) . d_(k+1) - e_right,  if seen
-  Q3  the box moves with the front that touches it; both sides of an axis move by the change of a
-      known one, up to 3 cm; an unknown side is where the contact ends; the first touch of another
-      face keeps the middle of its axis, if that was felt
+  Q3  the box moves with the front that touches it; a known side follows its end, up to 3 cm; an
+      unknown side reaches as far as any contact; the first touch of another face keeps the middle
+      of its axis, if that was felt
 
 A contact that is uneven for a second forgets all sides: then the box is a square of half width r
 behind the contact. Let g = h_2 be the way that is left, and m the middle of the box, left of the
@@ -32,8 +32,8 @@ of the base of m, or of the goal's line in a last leg that touches:
   Q7  back off by `back`: contact lost or off the front, |c| > l_edge (l_turn where uneven) before
       the last 0.2 m, or a new leg
   Q8  around m on a circle R beyond the box to a point `gap` behind its face, turned to d_k; push
-  Q9  look: where the last leg does not know an end of its face, c is that of the point `beyond` the
-      end of the contact there; a base that stays in front of the face shifts sideways
+  Q9  look: where a leg with k = 0 or 2 does not know an end of its face, c is that of the point
+      `beyond` the farthest contact there; a base that stays in front of the face shifts sideways
 
 A flush face is steered like a car in a last leg whose ends are known. The base turns about points
 beside the box's middle, a half depth r ahead of the face, so that this moves straight ahead. Then
@@ -44,10 +44,10 @@ the half width w on its corners follows up to the curvature w / (w^2 + depth^2),
       theta - K_h c_G within h_max:  omega = v clip(K_e (heading - yaw), +-kappa),
       v_y = -omega (r + the distance of the front)
 
-Without contact v_free and omega_free are the bounds. A base that cannot move sideways steers in Q6:
-omega towards the leg + K_h c, within h_max; in Q8 it drives forwards or in reverse. The law needs a
-flat front. In its smooth form the contact is a weight that mixes the twists of Q6; modes and legs
-switch.
+Without contact v_free and omega_free are the bounds; the base nears the box at its distance times
+1 / s. A base that cannot move sideways steers in Q6: omega towards the leg + K_h c, within h_max;
+in Q8 it drives forwards or in reverse. The law needs a flat front. In its smooth form the contact
+is a weight that mixes the twists of Q6; modes and legs switch.
 """
 
 from functools import partial
@@ -77,16 +77,13 @@ from rps_jax.spec import Bound, Spec, document
 PUSH, BACK, AROUND = 0, 1, 2  # modes
 _EDGE = 0.05  # [m] of contact beyond a known end, which contradicts it
 _SAME = 0.03  # [m] by which a face or an end may have moved between two contacts
-_FACING = 0.25  # [rad] between base and leg, up to which it feels the box
 _FLUSH, _UNEVEN = 0.4, -1.0  # [s] of even contact, and of uneven contact
 _HALF = 0.07, 0.5  # [m] half widths of objects
 _CARROT, _AHEAD = 0.5, 1.0  # [rad] of the aim on the circle: omnidirectional or not
 _PAST = 0.35  # [m] of the front beyond the face, at which an approach has failed
-_SIDESTEP = 0.1  # [m] of the next approach after one that felt nothing
 _HALF_FRONT = 0.29  # [m]
 _AROUND, _CENTRAL = 0.08, 0.2  # [m] behind the front, and from its middle
-_WIDER = 0.1  # [m] of the circle, after a touch on the way
-_TURNS = 0.8  # [rad] between base and leg, up to which the base turns while it touches
+_TURNS = 0.8  # [rad] between base and leg, up to which it feels the box and turns while it touches
 
 
 @document
@@ -195,11 +192,10 @@ class PoseState(NamedTuple):
     t_lost: Annotated[jax.Array, Spec("s", "time since the last contact")]
     t_push: Annotated[jax.Array, Spec("s", "time in contact of this push; 0 in an approach")]
     t_even: Annotated[jax.Array, Spec("s", "time of even contact; negative: of uneven contact")]
-    look: Annotated[jax.Array, Spec("m", "Q9, position of the base in the grid, to the left")]
+    look: Annotated[jax.Array, Spec("m", "Q9, position of the base to the left, in the leg")]
     looking: Annotated[jax.Array, Spec("1", "whether the base looks for an end")]
     looks: Annotated[jax.Array, Spec("1", "number of looks in this leg")]
     tries: Annotated[jax.Array, Spec("1", "number of repetitions")]
-    wider: Annotated[jax.Array, Spec("m", "growth of the circle after touches on the way")]
     side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around the object; -1: clockwise")]
     gear: Annotated[jax.Array, Spec("1", "1: forwards around the object; -1: in reverse")]
     done: Annotated[jax.Array, Spec("1", "whether the law is done")]
@@ -280,13 +276,9 @@ def feel(
     seen = obs.seen & flush
     is_known = was_known & (felt < sides + _EDGE)
     is_same = is_known & (jnp.abs(felt - sides) < _SAME)
-    share = jnp.where(t_even > 2 * _FLUSH, 0.1, 0.5)
-    measured = jnp.where(is_same, sides + share * (felt - sides), felt)
-    # Where one end is seen and not the other, this moves along if the face is the same.
-    is_known = is_known & (~seen | is_same | ~was_known)[::-1]
-    change = jnp.where(was_known & seen, measured - sides, 0.0)
-    carried = sides - change[::-1]
-    sides = jnp.where(seen, measured, jnp.where(is_known, carried, felt))
+    measured = jnp.where(is_same, sides + 0.1 * (felt - sides), felt)
+    unknown = jnp.where(centred[1], jnp.maximum(sides, felt), felt)
+    sides = jnp.where(seen, measured, jnp.where(is_known, sides, unknown))
     left, right = is_known | seen
     known = jnp.stack([far_known, left, known[2] | flush, right])
     h = jnp.stack([ahead, sides[0], behind, sides[1]])
@@ -339,8 +331,7 @@ def step(
     time, t_lost = state.time + touch.period, jnp.where(touches, 0.0, state.t_lost + touch.period)
     psi = theta + state.leg * (jnp.pi / 2)
     pushing = state.mode == PUSH
-    steers = omni & (state.leg == 0) & (state.t_even > 0.3)
-    is_facing = jnp.abs(planar.wrap(psi - yaw)) < jnp.where(steers, 2 * params.h_max, _FACING)
+    is_facing = jnp.abs(planar.wrap(psi - yaw)) < _TURNS
     feels = pushing & touches & on_front & is_facing & state.touched
 
     # The box. It moves with the front while this touches.
@@ -357,6 +348,9 @@ def step(
     forgets = first | (feels & (t_even <= _UNEVEN))
     square = Box(grid @ (middle - goal) + params.r, jnp.zeros(4, bool), jnp.zeros(2, bool))
     h, known, centred = soft.tree_where(forgets, square, soft.tree_where(feels, felt, box))
+
+    grows = touches & ~known
+    h = jnp.where(grows, jnp.maximum(h, grid @ (p_world_contact - goal)), h)
 
     # Q4 and Q5.
     y, way, way_left = (h[1] - h[3]) / 2, h[2], -fronts[0]
@@ -382,15 +376,14 @@ def step(
     room = room_of(way_left)
     is_off = last_leg & feels & settled & may_try
     is_off = is_off & (jnp.abs(y) > room + 0.01) & (way_left > s_min - 0.1)
-    passed = last_leg & pushing & state.touched & (way_left < -0.03)
     at_end = last_leg & feels & (way_left < params.stop)
     # A drum is never flush: a long push and a repetition are enough.
     is_uneven = (t_even < 0.3) & ((state.tries < 1) | (state.t_push < 20))
     is_blind = (t_even >= 0.3) & ~has_looked
     off_line = both & (jnp.abs(y) > params.y_miss)
     misses = at_end & may_try & (is_uneven | is_blind | off_line)
-    repeats = is_off | misses | (passed & may_try)
-    done = state.done | (at_end & ~misses) | (passed & ~may_try) | (time > params.t_end)
+    repeats = is_off | misses
+    done = state.done | (at_end & ~misses) | (time > params.t_end)
     chooses = first | is_back | is_beside | repeats
     room = room_of(way)
     sideways = jnp.where((jnp.abs(y) > room) & ~is_beside, jnp.where(y > 0, 3, 1), 0)
@@ -406,9 +399,10 @@ def step(
     ahead, box_left, behind, box_right = _turned(h, leg)
     along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
     middle_across, middle_along = (box_left - box_right) / 2, (ahead - behind) / 2
-    wants = last_leg & feels & ~chooses & (t_even > 0.6) & ~has_looked & (way_left > 0.03)
-    wants = wants & (state.t_push > 0.6)
-    target = jnp.where(known[1], -h[3] - params.beyond, h[1] + params.beyond)
+    wants = (leg % 2 == 0) & feels & ~chooses & (t_even > 0.6) & ~has_looked
+    wants = wants & (~last_leg | (way_left > 0.03)) & (state.t_push > 0.6)
+    knows_left = _turned(known, leg)[1]
+    target = jnp.where(knows_left, -box_right - params.beyond, box_left + params.beyond)
     look = jnp.where(wants, target, state.look)
     looking = (state.looking & ~(feels & (state.t_push > 0.5)) & ~turns) | wants
     looks = jnp.where(turns, 0.0, state.looks) + wants
@@ -421,9 +415,8 @@ def step(
     t_push = jnp.where(pushing, state.t_push + jnp.where(touches, touch.period, 0.0), 0.0)
     is_lost = (t_lost > 0.6) & (state.t_push > 0)
     failed = pushing & touched & (state.t_push == 0) & ~touches & (along > _PAST - behind)
-    # Nothing is felt there: the object lies ahead, perhaps at a dead taxel, and is sought aside.
-    ahead_of_front = planar.rotate(yaw, jnp.stack([params.r, state.side * _SIDESTEP]))
-    h = jnp.where(failed, grid @ (p_world_front + ahead_of_front - goal) + params.r, h)
+    # Nothing is felt there: the object lies ahead, perhaps at a dead taxel.
+    h = jnp.where(failed, grid @ (p_world_front + params.r * u - goal) + params.r, h)
     p_world_contact = jnp.where(failed, p_world_front, p_world_contact)
     known, looking = known & ~failed, looking & ~failed
     patience = jnp.where(looks > 0, 0.1, 0.4)
@@ -432,13 +425,10 @@ def step(
     hits = (state.mode == AROUND) & touches
     lands = hits & on_front & ~is_bad & is_facing & ~turns
     stops = hits & ~lands & (on_front | omni)
-    wider = state.wider + jnp.where(stops, _WIDER, 0.0)
-    wider = jnp.where(feels, 0.0, jnp.minimum(wider, 0.5))
     gap = jnp.sum((p_world_contact - p_world_front) * u)
     back = jnp.where((jnp.abs(face) < 0.1) & omni, 0.04, params.back)
-    on_way, at_side = state.wider > 0, jnp.abs(contact[1]) > 0.26
-    is_clear = (gap > back) | (on_way & (t_lost > 1.5)) | (omni & at_side & (t_lost > 2))
-    is_clear = is_clear & (state.mode == BACK)
+    at_side = omni & (jnp.abs(contact[1]) > 0.26)
+    is_clear = (state.mode == BACK) & ((gap > back) | (at_side & (t_lost > 2)))
 
     # Q8, of the base's middle or of its axle.
     ahead_u, left_u = planar.unit(psi), planar.unit(psi + jnp.pi / 2)
@@ -453,8 +443,8 @@ def step(
     is_direct = (jnp.abs(turn) < carrot) | behind_face if omni else turn < carrot
     half_along = jnp.clip((ahead + behind) / 2, *_HALF)
     half_across = jnp.clip((box_left + box_right) / 2, *_HALF)
-    R_s = half_along + half_length + params.gap + axle + wider
-    R = params.R + jnp.hypot(half_along, half_across) + axle + wider
+    R_s = half_along + half_length + params.gap + axle
+    R = params.R + jnp.hypot(half_along, half_across) + axle
     staging = m - jnp.where(behind_face, -jnp.sum(away * ahead_u), R_s) * ahead_u
     aim = jnp.where(is_direct, staging, m + R * planar.unit(phi + side * carrot))
     to_aim = aim - p_world_axle
@@ -489,7 +479,9 @@ def step(
     )
     steer = jnp.clip(params.K_h * lateral, -params.h_max, params.h_max)
     steer = jnp.where(follows, steer, 0.0) if omni else steer
-    v = jnp.where(touched, params.v_max, params.v_approach)
+    nears = touched & ~touches & (state.t_push == 0)
+    fast = jnp.where(nears, jnp.clip(-behind - along, params.v_max, params.v_free), params.v_max)
+    v = jnp.where(touched, fast, params.v_approach)
     v_last = jnp.clip(0.5 * way_left, 0.01, params.v_max)
     v_side = jnp.clip(-0.5 * beyond_line, 0.015, params.v_max)
     slow = jnp.where(last_leg, v_last, jnp.where(leg % 2 == 1, v_side, v))
@@ -497,10 +489,9 @@ def step(
     turn_left = planar.wrap(psi + steer - yaw)
     arm = half_length + params.r
     curve = jnp.clip(params.K_e * turn_left, -kappa, kappa)
-    shift = (h[1] - h[3]) / 2 - fronts[1]
     v = jnp.where(
         follows,
-        jnp.minimum(v, params.v_max / jnp.hypot(1 + jnp.abs(curve * shift), curve * arm)),
+        jnp.minimum(v, params.v_max / jnp.hypot(1.0, curve * arm)),
         v,
     )
     bound = soft.where(weight, params.omega_push, params.omega_max)
@@ -512,12 +503,10 @@ def step(
     may_slide = omni & touched & (touches | (t_push == 0))
     v_y = jnp.where(may_slide, jnp.clip(gain * lateral, -bound, bound), 0.0)
     v_y = v_y - jnp.where(follows, omega * arm, 0.0)
-    v = v + jnp.where(follows, omega * shift, 0.0)
     # Q7 and Q8.
-    flee = -contact / jnp.maximum(planar.norm(contact), 1e-3)
-    flee = jnp.where(omni & on_way, flee, -planar.unit(jnp.zeros_like(yaw))) * params.v_free
+    flee = jnp.array([-1.0, 0.0]) * params.v_free
     if omni:
-        speed = jnp.minimum(params.v_free, 0.5 * planar.norm(to_aim) + 0.005)
+        speed = jnp.minimum(params.v_free, 1.5 * planar.norm(to_aim))
         drive = planar.rotate(-yaw, planar.unit(heading) * speed)
         spin = 2 * face
     else:
@@ -528,7 +517,7 @@ def step(
     spin = jnp.where(mode == BACK, 0.0, jnp.clip(spin, -params.omega_free, params.omega_free))
     free_x, free_y = jnp.where(mode == BACK, flee, drive)
     free = Twist(free_x, free_y, spin), params.v_free, params.omega_free
-    push = Twist(v, v_y, omega), params.v_max, params.omega_max
+    push = Twist(v, v_y, omega), fast, params.omega_max
     twist, v_max, omega_max = soft.tree_where(mode == PUSH, push, free)
     v, v_y, omega = (jnp.where(done, 0.0, x) for x in twist)
     v_y = v_y if omni else v_y + axle * omega
@@ -555,7 +544,6 @@ def step(
         looking,
         looks,
         tries,
-        wider,
         side,
         gear,
         done,
