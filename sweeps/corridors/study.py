@@ -14,7 +14,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import xarray as xr
@@ -25,7 +25,6 @@ from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.laws import LawParams, LawsLike
 from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, call_of, option
 from rps_jax.world.tasks.corridor import BASE, OBJECT, Corridor
-from rps_jax.world.tasks.path import Path
 from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.corridors.widths import Curve, fit
 from sweeps.study_base import Rows, Study, Table, run_together
@@ -114,7 +113,7 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         choice = run.checkpoint("choice", lambda: run_together([choosing], run)[0])
         chosen = best_lookaheads(choice)
         corridors = run.checkpoint("corridors", partial(self._corridors, chosen, run))
-        path = Path(lookahead=drawn, length=LENGTH, turn_angle=any_turn)
+        path: Any = {"kind": "path", "lookahead": drawn, "length": LENGTH, "turn_angle": any_turn}
         follow = self._plan(path, self.paths, self.chosen)
         paths = run.checkpoint("paths", lambda: run_together([follow], run)[0])
         parts = {"choice": choice, "corridors": corridors, "paths": paths}
@@ -132,16 +131,14 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
 
     def _plan(
         self,
-        task: Path,
+        task: Any,
         worlds: int,
         laws: Mapping[str, LawParams],
         split: Literal["tune", "test"] = "test",
     ) -> Plan:
         """Return the plan of a task; worlds of one split depend on the seed alone."""
         setting = replace(self.setting, split=split)
-        return Plan(
-            replace(parse_domain(self.domain), task=task, targets=()), worlds, laws, setting
-        )
+        return Plan(parse_domain(self.domain, None, task), worlds, laws, setting)
 
     def _corridors(self, chosen: Mapping[str, float], run: Run) -> xr.Dataset:
         """Run corridors of all turns, each law with its lookahead."""

@@ -25,7 +25,6 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.analysis.figures.style import quantity
-from rps_jax.engines import device
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import no_progress, set_phase
 from rps_jax.tuning import fit, posterior
@@ -81,8 +80,8 @@ class Methods(FitStudy):
         has some logs and does not need the others. Networks learn meanwhile.
         """
         quiet = run._replace(callback=no_progress)
-        context, cpu = multiprocessing.get_context("spawn"), ("cpu",)
-        with context.Pool(len(os.sched_getaffinity(0)), device.choose, cpu) as pool:
+        context, cpu = multiprocessing.get_context("spawn"), ("jax_platforms", "cpu")
+        with context.Pool(len(os.sched_getaffinity(0)), jax.config.update, cpu) as pool:
             jobs = [
                 pool.starmap_async(_fit_part, [(self, quiet, method, i) for i in parts], 1)
                 for method, parts in self._parts.items()

@@ -26,12 +26,11 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax import Range, Robot, Rules, Setting
+from rps_jax import Robot, Rules, Setting
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.laws import LawsLike
 from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, call_of, option
-from rps_jax.world.tasks.path import Path
 from rps_jax.worlds import parse_domain
 from sweeps.force_push_grid import grid
 from sweeps.study_base import (
@@ -99,10 +98,7 @@ class Paths(PlanStudy[xr.DataTree], QuickStudy[xr.DataTree], MultiLawQuestion[xr
             LOOKAHEADS, RADII.items(), _OBJECTS
         ):
             points = np.add(grid.curve(radius, LENGTH), (front, 0.0))
-            task = Path(
-                lookahead=Range(lookahead, lookahead),
-                waypoints=tuple((float(x), float(y)) for x, y in points),
-            )
+            task = {"kind": "path", "lookahead": lookahead, "waypoints": points.tolist()}
             domain = parse_domain(f"{_SLIDER},objects={_OBJECTS[slider]}", None, task)
             plans[f"{lookahead} {name} {slider}"] = Plan(
                 domain, self.worlds, self.chosen, self.setting

@@ -23,13 +23,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+import jax
 import numpy as np
 import xarray as xr
 from scipy.io import loadmat
 from scipy.optimize import linear_sum_assignment
 
 from rps_jax import InputError, fit_object
-from rps_jax.engines import device
 from rps_jax.questions import Run, call_of, option
 from rps_jax.tuning import objects
 from rps_jax.tuning.objects import PRIOR, Pushes
@@ -211,7 +211,10 @@ class Mit(QuickStudy[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Fit each cell to 20 % of its pushes, and then to few with the prior of the others."""
         cores = len(os.sched_getaffinity(0))
-        context, choose = multiprocessing.get_context("spawn"), partial(device.choose, "cpu")
+        context, choose = (
+            multiprocessing.get_context("spawn"),
+            partial(jax.config.update, "jax_platforms", "cpu"),
+        )
         processes = ProcessPoolExecutor(cores, context, choose)
         with processes, ThreadPoolExecutor(2 * cores) as threads:
 
