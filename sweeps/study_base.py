@@ -29,7 +29,7 @@ import xarray as xr
 
 from rps_jax import InputError, Setting, errors, load
 from rps_jax.laws import resolve_law
-from rps_jax.questions import Picture, Plan, Run, Section
+from rps_jax.questions import Picture, Plan, Run, Section, option
 from rps_jax.record import options, provenance
 from rps_jax.runs import execution
 from rps_jax.runs.question import Question, QuickQuestion, TrialQuestion
@@ -201,7 +201,7 @@ class Study(Question[T]):
 class CollectedStudy(Study[xr.Dataset]):
     """Base class of studies whose parts may run apart, each in a separate run folder."""
 
-    runs: tuple[str, ...] = options.option((), positional=True)
+    runs: tuple[str, ...] = option((), positional=True)
     """Run folders of this study, to collect their results."""
 
     def answer(self, run: Run) -> xr.Dataset:
