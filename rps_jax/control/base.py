@@ -169,7 +169,7 @@ class Law(Generic[Params, State, Obs]):
     # state -> bool: whether the law declares that it is done, which ends the trial.
     is_done: Callable[[State], jax.Array] | None = None
     # State of one trial, and position and heading (3,) [m, m, rad] of the goal -> what is shown.
-    memory: Callable[[State, np.ndarray], Memory] = lambda state, goal: Memory()
+    memory: Callable[[State, np.ndarray], Memory] | None = None
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None
 

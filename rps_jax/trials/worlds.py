@@ -96,7 +96,8 @@ def memory_of(world: World, params: LawParams, state: Pytree) -> Memory:
     """Return what the law with a state remembers in a world, for pictures."""
     target, heading = np.asarray(world.p_world_target, float), heading_of(world.task)
     yaw = np.arctan2(target[1], target[0]) if heading is None else float(heading)
-    return registry.law_of(params).memory(state, np.append(target, yaw))
+    law = registry.law_of(params)
+    return Memory() if law.memory is None else law.memory(state, np.append(target, yaw))
 
 
 class Job(NamedTuple):

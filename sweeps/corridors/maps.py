@@ -15,19 +15,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
 import xarray as xr
 from PIL import Image
+from ruamel import yaml
 
 from rps_jax import InputError, Rules, Setting, evaluate
 from rps_jax.analysis import statistics
 from rps_jax.questions import Run, call_of, option
-from rps_jax.record import files
-from rps_jax.world.tasks import parse_task
-from rps_jax.world.tasks.base import Task
 from rps_jax.worlds import parse_domain
 from sweeps.corridors.costs import cost_of, domain_of
 from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table
@@ -96,7 +94,7 @@ class Maps(SpeedStudy[xr.Dataset]):
         scale, start, goal, cells = push_of(path)
         ends = f"start={':'.join(map(str, start))},goal={':'.join(map(str, goal))}"
         begin = time.perf_counter()
-        task = parse_task(f"rooms,{path},{ends},scale={scale}:{scale}")
+        task = parse_domain("wide", None, f"rooms,{path},{ends},scale={scale}:{scale}").task
         load = time.perf_counter() - begin
         begin = time.perf_counter()
         replace(task, goal=((goal[0] + 1e-3, goal[1]),))  # plans again, with the walls it has
@@ -119,7 +117,7 @@ class Maps(SpeedStudy[xr.Dataset]):
         }
         return xr.Dataset({name: ((), float(x)) for name, x in values.items()})
 
-    def _cost(self, task: Task) -> float:
+    def _cost(self, task: Any) -> float:
         """Return the cost of a simulated second in a map, relative to `reach`."""
         boxes = "wide,objects=random_box"
         domains = domain_of("reach"), parse_domain(boxes, None, task)
@@ -134,7 +132,7 @@ maps = call_of(Maps)
 
 def push_of(path: Path) -> tuple[int, tuple[float, float, float], tuple[float, float], int]:
     """Return scale, start [m, m, rad] and goal [m] of a push in a map, and its number of cells."""
-    fields = files.read_fields(path)
+    fields = yaml.YAML(typ="safe").load(path)
     shades = np.asarray(Image.open(path.parent / fields["image"]).convert("L"))[::-1] / 255
     occupied = shades if fields.get("negate") else 1 - shades
     # With the threshold of most maps, unknown cells are walls.

@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import json
 import sys
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from rps_jax import Law, register_law
-from rps_jax.control.learned import network, policy
-from rps_jax.control.learned.network import LearnedParams
-from rps_jax.laws import Bound
+from rps_jax import register_law
+from rps_jax.control.learned import policy
+from rps_jax.laws import Bound, law_of, resolve_law
 
 POLICY = policy.read("learned")
-_TASK = LearnedParams()
+_TASK = resolve_law("learned")[1]
+_LAW: Any = law_of(_TASK)
 
 
 class Weights(NamedTuple):
@@ -35,21 +35,16 @@ class Weights(NamedTuple):
 def step(params: Any, state: Any, obs: Any) -> Any:
     """Run the learned law with changed weights."""
     weights = jax.tree.map(lambda x, change: x + change, POLICY.weights, params.weights)
-    return network.step(POLICY.network, weights, params, state, obs)
+    return _LAW.step.func(POLICY.network, weights, params, state, obs)
 
 
-LAW = Law(
-    partial(network.init, POLICY.network),
-    step,
-    "taxels",
-    bounds={f"weights.{name}": Bound(-0.1, 0.1) for name in POLICY.weights},
-    observe_sent=network.observe_sent,
-)
+BOUNDS = {f"weights.{name}": Bound(-0.1, 0.1) for name in POLICY.weights}
+LAW = replace(_LAW, step=step, bounds=BOUNDS)
 zeros = {name: np.zeros(x.shape) for name, x in POLICY.weights.items()}
 register_law("learned_weights", LAW, Weights(zeros))
 
 
-def tuned_policy(values: dict[str, Any]) -> policy.Policy:
+def tuned_policy(values: dict[str, Any]) -> Any:
     """Return the law with the changes of `tuned.json`."""
     weights = {
         name: np.float32(x + np.asarray(values[f"weights.{name}"]))
