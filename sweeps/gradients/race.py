@@ -96,7 +96,7 @@ class Lockstep:
         question, *_ = (question for question, _, _ in waiting)
         try:
             # Batches of similar sizes run in one program.
-            options = {"capacity": lambda trials: 1 << (trials - 1).bit_length()}
+            options: Any = {"capacity": lambda trials: 1 << (trials - 1).bit_length()}
             scores, timing = score_candidates(
                 requests, question.setting, question.objective, **options
             )

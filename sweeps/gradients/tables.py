@@ -56,7 +56,8 @@ def interpolate(table: jax.Array, u: jax.Array, v: jax.Array) -> jax.Array:
 
 def init(params: Tables, temperatures: Any = None) -> Any:
     """Return the initial state of RPS or RPS+."""
-    return law_of(params.rps).init(params.rps, temperatures)
+    law: Any = law_of(params.rps)
+    return law.init(params.rps, temperatures)
 
 
 def step(params: Tables, state: Any, obs: Any, temperatures: Any = None) -> Any:
@@ -71,7 +72,8 @@ def step(params: Tables, state: Any, obs: Any, temperatures: Any = None) -> Any:
     eta, gain = (jnp.exp(interpolate(x, u, v)) for x in (params.eta, params.K_h))
     changed = rps._replace(eta=rps.eta * eta, K_h=rps.K_h * gain)
     changed = params.rps._replace(law=changed) if is_plus else changed
-    return law_of(params.rps).step(changed, state, obs, temperatures)
+    law: Any = law_of(params.rps)
+    return law.step(changed, state, obs, temperatures)
 
 
 def register(name: str, count: int, rps: Any, bounds: Mapping[str, Bound] = BOUNDS) -> type:

@@ -27,12 +27,12 @@ class Weights(NamedTuple):
     """Changes of the weights, and limits."""
 
     weights: Any  # [1] by name
-    d_success: float = _TASK.d_success
-    v_max: float = _TASK.v_max
-    omega_max: float = _TASK.omega_max
+    d_success: Any = _TASK.d_success
+    v_max: Any = _TASK.v_max
+    omega_max: Any = _TASK.omega_max
 
 
-def step(params: Weights, state: Any, obs: Any) -> Any:
+def step(params: Any, state: Any, obs: Any) -> Any:
     """Run the learned law with changed weights."""
     weights = jax.tree.map(lambda x, change: x + change, POLICY.weights, params.weights)
     return _LAW.step.func(POLICY.network, weights, params, state, obs)
