@@ -59,7 +59,7 @@ _BETWEEN_WALLS = {
     "corridors of 1.1 to 1.6 m, turns of 45°": f"{_CORRIDOR},width=1.1:1.6,turn_angle=0.785:0.786"
     " --worlds 1500",
     "corridors of 1.1 to 2.5 m": f"{_CORRIDOR},width=1.1:2.5,turn_angle=0:1.57 --worlds 3000",
-    **{f"`{name}`": f"--domain {name} --worlds 10000" for name in ("hostile", "real", "wide")},
+    **{f"`{name}`": f"--domain {name} --worlds 2000" for name in ("hostile", "real", "wide")},
 }
 _PLUS = {
     "`wide`, 10,000": "rps ladder --domain wide --worlds 10000 --seed 10 --laws rps_plus rps_tuned",
