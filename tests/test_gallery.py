@@ -81,7 +81,7 @@ def trace_of(seconds=60, outcomes=(), **columns):
 TIME = np.arange(0, 60 + 1e-9, 0.1)
 MOVING = {"yaw": 0.01 * TIME}  # a slow turn on the spot
 TOUCH = MOVING | {"contact_type": np.ones(TIME.size)}
-STATE = "Realignment State"
+STATE = "realigning or repositioning"
 SWAY = 0.1 * np.sin(2 * np.pi * TIME / 20)  # of 20 cm, six reversals
 MECHANISMS = {
     "a motion without a mechanism": (MOVING, {}),

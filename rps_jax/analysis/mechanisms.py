@@ -31,7 +31,7 @@ THRESHOLDS = (
     f"{REVERSALS} reversals of a motion to and fro (of {100 * SWAY:g} cm; of the contact over half "
     f"of the base's width), a tilt of {np.rad2deg(TILT):.0f} deg, a turn of the object by "
     f"{np.rad2deg(TURN):.0f} deg, {SIDE_TIME:g} s of contact on a side of the base (more than "
-    f"{100 * CORNER:g} cm behind the front), and any time in the Realignment State."
+    f"{100 * CORNER:g} cm behind the front), and any time in the Realignment State or a reposition."
 )
 
 
@@ -63,7 +63,7 @@ def measured(trace: xr.Dataset) -> dict[str, str]:
     realigning = trace.realigning.values > 0.5
     if realigning.any():
         duration = period[realigning[:-1]].sum()
-        measures["Realignment State"] = f"{_times(realigning)}, {duration:.0f} s in all"
+        measures["realigning or repositioning"] = f"{_times(realigning)}, {duration:.0f} s in all"
 
     lateral = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)  # axis of the base
     sway = np.sum(np.diff(base, axis=0) * (lateral[:-1] + lateral[1:]) / 2, axis=1).cumsum()

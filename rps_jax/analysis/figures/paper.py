@@ -55,7 +55,8 @@ def profile(params: RPSParams) -> Figure:
 def one_trial(trace: xr.Dataset, title: str) -> Figure:
     """Draw Fig. 6: the path with contact points; velocities; l and a_r; contact type.
 
-    Blue shade: Realignment State. Yellow shade: no contact. Dashed line: `l_cr`, if the law has it.
+    Blue shade: Realignment State, or a reposition. Yellow shade: no contact. Dashed line: `l_cr`,
+    if the law has it.
     The trace is of one trial over time; it holds the contact point `p_world_contact`, the target
     and the radius `d_success`.
     """
@@ -94,7 +95,7 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
     for ax in (velocity, offset, kind):
         shade(ax, time, trace.realigning.values > 0.5, SHADES["realigning"])
         shade(ax, time, ~touching, SHADES["lost"])
-    bands = (("Realignment State", SHADES["realigning"]), ("no contact", SHADES["lost"]))
+    bands = (("realigning or repositioning", SHADES["realigning"]), ("no contact", SHADES["lost"]))
     marks = [patches.Patch(color=colour, label=name) for name, colour in bands]
     legend_above(kind, handles=marks)
     result = "reached" if trace.outcome_success else "not reached"
