@@ -43,7 +43,7 @@ def test_the_table_has_intervals_over_the_seeds():
     assert_allclose(second[4:7:2], [[25.0] * 3, [0.25] * 3])
 
 
-@pytest.mark.parametrize(("name", "law"), [("Tuned64", "rps_tuned"), ("Plus64", "rps_plus")])
+@pytest.mark.parametrize(("name", "law"), [("Table64", "rps"), ("Plus64", "rps_plus")])
 def test_a_constant_table_multiplies_the_parameters(name, law):
     table, params = (resolve_law(x)[1] for x in (f"sweeps/gradients/tables.py:{name}", law))
     rps = getattr(params, "law", params)

@@ -4,7 +4,7 @@
 
 A table is bilinear in the logarithm of the distance from contact to target, between 0.05 and 3 m,
 and in the offset |l| up to 0.3 m. Its values are factors, as logarithms. All are 0 at first.
-`Table64` has the paper's parameters of RPS; `Tuned64` has those of `rps_tuned`, and `Plus64` is
+`Table64` has the paper's parameters of RPS, and `Plus64` is
 RPS+.
 """
 
@@ -88,5 +88,4 @@ PAPER, PLUS = RPSParams.paper(), resolve_law("rps_plus")[1]
 K_V = {"rps.K_v": dict(law_of(PAPER).bounds)["K_v"]}
 Table64, Table512, Table2048 = (register(f"Table{n}", n, PAPER) for n in (64, 512, 2048))
 Table4097 = register("Table4097", 4097, PAPER, BOUNDS | K_V)
-Tuned64, Tuned2048 = (register(f"Tuned{n}", n, RPSParams.tuned()) for n in (64, 2048))
 Plus64, Plus2048 = (register(f"Plus{n}", n, PLUS) for n in (64, 2048))
