@@ -4,8 +4,7 @@
 
 A table is bilinear in the logarithm of the distance from contact to target, between 0.05 and 3 m,
 and in the offset |l| up to 0.3 m. Its values are factors, as logarithms. All are 0 at first.
-`Table64` has the paper's parameters of RPS, and `Plus64` is
-RPS+.
+`Table64` changes RPS with the paper's parameters, and `Plus64` changes RPS+.
 """
 
 from __future__ import annotations
