@@ -104,7 +104,7 @@ distance.to_series().unstack("law").round(3)
 # | yes | no | 95 ± 1 % | 35 ± 4 % | 27 ± 3 % | 96 ± 2 % |
 # | yes | yes | 3 ± 1 % | 43 ± 4 % | 19 ± 3 % | 3 ± 2 % |
 #
-# <sub>Device: one NVIDIA H200 and 16 processors; date: 2026-11-26; [command, versions and values](../sweeps/paper_reading/results/reading_evidence.json).</sub>
+# <sub>Computed before the hardware's experiments got the closet. Device: one NVIDIA H200 and 16 processors; date: 2026-11-26; [command, versions and values](../sweeps/paper_reading/results/reading_evidence.json).</sub>
 # <!-- end -->
 #
 # The numbers of the hardware decide: $\omega$ follows from the saturated $v_x$, and $(v_x, v_y)$ is
@@ -135,7 +135,7 @@ distance.to_series().unstack("law").round(3)
 # | the Realignment State ... remained active until ... the center of the robot | yes | 55 ± 6 % |
 # | the robot successfully pushed the object to the target | yes | 100 ± 0 % |
 #
-# <sub>Device: one NVIDIA H200 and 16 processors; date: 2026-11-26; [command, versions and values](../sweeps/paper_reading/results/reading_figure_6.json).</sub>
+# <sub>Computed before the hardware's experiments got the closet. Device: one NVIDIA H200 and 16 processors; date: 2026-11-26; [command, versions and values](../sweeps/paper_reading/results/reading_figure_6.json).</sub>
 # <!-- end -->
 #
 # ![Fig. 6 in this draw](../sweeps/paper_reading/figure_6.png)

@@ -68,6 +68,48 @@ STALE: dict[str, str] = {
         ("ground", "straight"), "a push ran in the program of a sweep, with other last bits"
     ),
     **dict.fromkeys(
+        ("engines_ideal", "engines_wide", "headline", "models", "tasks_parity"),
+        "objects got supports, with other last bits of C MuJoCo",
+    ),
+    **dict.fromkeys(
+        ("bearings", "ceiling", "ladder", "plus", "saturation", "tuned"),
+        "the ladder, whose small run tells of changes, got more laws",
+    ),
+    **dict.fromkeys(
+        (
+            "reading_checks",
+            "reading_evidence",
+            "reading_figure_6",
+            "reading_numbers",
+            "reading_posterior",
+        ),
+        "the hardware's experiments got the closet",
+    ),
+    **dict.fromkeys(
+        (
+            "export_bags",
+            "export_inputs",
+            "export_odd",
+            "export_paper",
+            "export_speed",
+            "export_trials",
+            "export_worlds",
+        ),
+        "exported code tests the bits of numbers for NaN",
+    ),
+    **dict.fromkeys(
+        (
+            "drives_learned",
+            "gradients_mjx",
+            "gradients_tables",
+            "learned_failures",
+            "learned_test",
+            "learned_windows",
+            "sb3",
+        ),
+        "the value function of `rps learn` observes the room to walls",
+    ),
+    **dict.fromkeys(
         (
             "fit_one_push",
             "gradients_direction",
