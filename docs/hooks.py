@@ -383,11 +383,16 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-UNSEARCHED = ("CHANGELOG.md", *(f"reference/{x}.md" for x in ("app", "geometry", "lowering")))
+UNSEARCHED = (
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "sweeps/publish/README.md",
+    *(f"reference/{x}.md" for x in ("app", "geometry", "lowering")),
+)
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Point the links to pages of the site; leave history and inner modules out of the search."""
+    """Point the links to pages of the site; leave history and inner matters out of the search."""
     if page.file.src_uri in UNSEARCHED:
         page.meta["search"] = {"exclude": True}
     fences: list[str] = []
