@@ -164,10 +164,11 @@ class Named:
     names: Callable[[], Iterable[str]]
 
 
-def named_in(hint: Any) -> Named | None:
-    """Return the names of a type, of an alternative of it, or of its items."""
-    parts = (*getattr(hint, "__metadata__", ()), *map(named_in, typing.get_args(hint)))
-    return next((x for x in parts if isinstance(x, Named)), None)
+def annotation_in(hint: Any, kind: type[T]) -> T | None:
+    """Return the annotation of a kind of a type, of an alternative of it, or of its items."""
+    metadata = getattr(hint, "__metadata__", ())
+    inner = (annotation_in(x, kind) for x in typing.get_args(hint) if not metadata)
+    return next((x for x in (*metadata, *inner) if isinstance(x, kind)), None)
 
 
 def spec_of(annotation: Any) -> Spec | None:

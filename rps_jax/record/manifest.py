@@ -10,11 +10,11 @@ import functools
 import typing
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from rps_jax.record import options
 from rps_jax.record.files import JsonObject
-from rps_jax.record.options import Hint
+from rps_jax.spec import annotation_in
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,15 +35,8 @@ class Stored:
 def stored_types(kind: type) -> dict[str, Stored]:
     """Return the annotations of the fields of a dataclass that have one, by name."""
     hints = typing.get_type_hints(kind, include_extras=True)
-    pairs = ((f.name, _annotation(hints[f.name])) for f in dataclasses.fields(kind))
+    pairs = ((f.name, annotation_in(hints[f.name], Stored)) for f in dataclasses.fields(kind))
     return {name: stored for name, stored in pairs if stored is not None}
-
-
-def _annotation(hint: Hint) -> Stored | None:
-    """Return the annotation of a type, of an alternative of it, or of its items."""
-    metadata = getattr(hint, "__metadata__", ())
-    inner = (_annotation(x) for x in get_args(hint) if not metadata)
-    return next((x for x in (*metadata, *inner) if isinstance(x, Stored)), None)
 
 
 def fields_to_json(record: Any, ignored: Collection[str] = ()) -> JsonObject:

@@ -39,7 +39,7 @@ from rps_jax.runs.question import (
     current_names,
     quick_defaults,
 )
-from rps_jax.spec import Spec, named_in, specs_of
+from rps_jax.spec import Named, Spec, annotation_in, specs_of
 from rps_jax.trials.setting import PhysicsField, Setting
 from rps_jax.trials.trial import Rules
 
@@ -230,7 +230,7 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 def _text_of(kind: type, name: str, markers: tuple[Any, ...]) -> str:
     """Return the help of a field: its docstring, and the names that its texts may begin with."""
-    named = named_in(typing.get_type_hints(kind, include_extras=True)[name])
+    named = annotation_in(typing.get_type_hints(kind, include_extras=True)[name], Named)
     names = f" Names: {', '.join(named.names())}." if named else ""
     return (_field_docs(kind, name, markers) or "") + names
 
