@@ -9,7 +9,7 @@ live.shove((0.0, 0.2))
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -167,7 +167,7 @@ class Live:
 
 def yaw_target(worlds: World) -> float | None:
     """Return the heading of the goal of the first world [rad]; None if it has none."""
-    heading: Any = heading_of(worlds.task)
+    heading = heading_of(worlds.task)
     return None if heading is None else float(heading[0])
 
 

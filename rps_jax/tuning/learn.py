@@ -42,6 +42,7 @@ from rps_jax.tuning.collection import RunnerState
 from rps_jax.tuning.ppo import PPO
 from rps_jax.tuning.run import Domains, parse_domains
 from rps_jax.world.domain import Domain, task_attribute, to_json
+from rps_jax.world.tasks.base import heading_of
 
 _CHECKPOINT = "learner"
 _VALIDATION_RATIO = 10  # learning time between two validations, as a multiple of their time
@@ -146,7 +147,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         errors.check_each_once("domain", self.domains)
         for domain in self.domains:
             errors.check_name("skin of a domain to learn in", domain.skin, ("capacitive",))
-            if domain.task.HAS_HEADING:
+            if heading_of(domain.task) is not None:
                 rule = "a learned law does not sense the heading of a goal; choose another task"
                 raise errors.not_allowed("task", domain.task.kind, rule)
         self.setting.simulator.check_traced()

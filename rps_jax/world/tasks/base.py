@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.geometry.arrays import Array, Bool, Float, Floats, Pytree, Scalar, Vector
+from rps_jax.geometry.arrays import Array, Bool, Float, Pytree, Scalar, Vector
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import check_fields
@@ -72,8 +72,11 @@ class Course(Protocol):
         ...
 
 
-def heading_of(course: Course) -> Floats | None:
-    """Return the heading of a course's goal [rad], its field `heading`; None if it has none."""
+def heading_of(course: Course | Task) -> Any:
+    """Return the heading of a course's goal [rad], or a task's range of it; None without one.
+
+    It is the field `heading` of either.
+    """
     return getattr(course, "heading", None)
 
 
@@ -93,7 +96,6 @@ class Task:
     kind: str = ""  # name of the task
     OUTCOMES: ClassVar[Mapping[str, Spec]] = {}  # those that it adds, by name
     HAS_TARGET: ClassVar[bool] = False  # whether trials end at the domain's targets
-    HAS_HEADING: ClassVar[bool] = False  # whether the goal has a heading
     # Names of which one identifies a mapping without a kind; `read` turns them into fields.
     MARKS: ClassVar[tuple[str, ...]] = ()
     NUMBERS: ClassVar[tuple[str, ...]] = ()  # names of random numbers without a range

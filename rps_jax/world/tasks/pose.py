@@ -133,7 +133,6 @@ class Pose(Task):
 
     kind: str = "pose"
     HAS_TARGET = True
-    HAS_HEADING = True
     OUTCOMES: ClassVar[dict[str, Spec]] = {
         "place_error": Spec("m", "distance of the pushed face's middle from the goal at the end"),
         "sideways_error": Spec("m", "part of it across the goal's heading"),
