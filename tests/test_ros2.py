@@ -234,7 +234,7 @@ def test_a_path_replaces_the_target_until_it_ends(driven):
     ],
 )
 def test_the_node_compiles_without_a_warning(law, robot, tmp_path):
-    """With declarations of `rclcpp` in place of ROS."""
+    """Declarations of `rclcpp` take the place of ROS."""
     if shutil.which("g++") is None:
         pytest.skip("there is no g++: run `apt-get install -y g++`")
     node = FOLDER / "src" / "push_node.cpp"

@@ -33,7 +33,7 @@ Senses = Literal["touch", "taxels", "ends", "force", "pose"]
 
 
 class Memory(NamedTuple):
-    """What pictures and the viewer show of the state of a law."""
+    """Mode of a law and the object's place in its state, for pictures and the viewer."""
 
     mode: str = ""  # in words; empty in a push
     p_world_object: ArrayLike = (np.nan, np.nan)  # (2,) [m] remembered middle; NaN: none
@@ -168,7 +168,7 @@ class Law(Generic[Params, State, Obs]):
     heading: bool = False
     # state -> bool: whether the law declares that it is done, which ends the trial.
     is_done: Callable[[State], jax.Array] | None = None
-    # State of one trial, and position and heading (3,) [m, m, rad] of the goal -> what is shown.
+    # (state, goal) -> Memory of one trial; the goal (3,) [m, m, rad] has position and heading.
     memory: Callable[[State, np.ndarray], Memory] | None = None
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None

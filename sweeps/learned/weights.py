@@ -20,7 +20,7 @@ from rps_jax.laws import Bound, law_of, resolve_law
 
 POLICY = policy.read("learned")
 _TASK = resolve_law("learned")[1]
-_LAW: Any = law_of(_TASK)
+_LAW: Any = law_of(_TASK)  # its step is a function of network and weights, with both given
 
 
 class Weights(NamedTuple):

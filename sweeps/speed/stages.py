@@ -43,7 +43,7 @@ STAGES = {
     "report": ("rps_jax.app.cli.running._report",),
 }
 FIRST, LAST = "start of Python", "end of the process"  # before and after the samples
-OTHER = "other"  # what has no stage
+OTHER = "other"  # time without a stage
 SAMPLER = Path(__file__).with_name("sampler.py")
 
 
