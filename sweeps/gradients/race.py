@@ -1,4 +1,4 @@
-"""Race derivatives, slopes and evolution: equal simulated time and equal wall time.
+"""Race derivatives, slopes and evolution at equal simulated time.
 
 All tunings of a problem run in lockstep: their trials form one batch. Each has a separate folder
 with its generations, so a killed race resumes. The generation with the best validation within a
@@ -54,7 +54,6 @@ SCORES = "success", "score"  # of a trial in a test world
 FIRST = "derivatives"  # method with which the others are compared
 _LARGE = 500  # parameters from which evolution has a diagonal covariance
 _QUICK = {"worlds": 4, "validation": 4, "objects": ("random_cylinder",)}
-BUDGETS = ("simulated", "wall")
 
 
 class Lockstep:
@@ -148,16 +147,16 @@ METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
-    """Race derivatives, slopes and evolution: equal simulated time and equal wall time.
+    """Race derivatives, slopes and evolution at equal simulated time.
 
     The answer has `success` and `score` (count, seed, method, budget, world) of the tuned laws in
-    test worlds, and those of the law at the start, `start_success` and `start_score` (count,
-    world). Budgets are `wall` or `simulated` with an amount [s].
+    test worlds, the `wall` time [s] of their tunings (count, seed, method, budget), and success and
+    score of the law at the start, `start_success` and `start_score` (count, world).
     """
 
     TITLE: ClassVar[str] = "Derivatives against evolution"
     CHOICES: ClassVar = {"methods": METHODS}
-    GROWS: ClassVar[tuple[str, ...]] = ("counts", "file")
+    GROWS: ClassVar[tuple[str, ...]] = ("counts",)
     QUICK: ClassVar[Mapping[str, Any]] = {
         "worlds": 4,
         "counts": (64,),
@@ -179,13 +178,9 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     """Seeds of the tunings."""
     simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
     """Budgets of simulated time [s]; a differentiated second counts as four. After the largest no
-    generation starts; without any, those of wall time limit the tunings."""
-    wall: tuple[float, ...] = option((), above=0, unit="s")
-    """Budgets of wall time without compilation [s]."""
+    generation starts."""
     worlds: int = option(400, 1, 1_000_000)
     """Number of test worlds of `wide`."""
-    file: str = "gradients_race"
-    """Name of the data file."""
     setting: Setting = field(default=Setting(rules=Rules(horizon=150.0)), kw_only=True)
     out: Path | str | None = field(default="runs/race", kw_only=True)
     """Run folder; the tunings have folders there."""
@@ -193,8 +188,7 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     def check(self) -> None:
         super().check()
         check_counts(self.counts)
-        if not (self.simulated or self.wall):
-            raise errors.InputError("simulated and wall are empty: give a budget of one of them.")
+        errors.check_each_once("simulated", self.simulated)
 
     def parts(self, run: Run) -> Parts:
         """Return the function that runs and tests the tunings of each count."""
@@ -204,11 +198,10 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     def tuning(self, seed: int, count: int, method: str) -> Tuning:
         """Return a tuning of the race."""
         kind, options = METHODS[method]
-        setting, budget = replace(self.setting, seed=seed), max(self.simulated, default=0.0)
+        setting = replace(self.setting, seed=seed)
         diagonal = {"estimator": "sep_cma"} if method == "evolution" and count >= _LARGE else {}
         sizes = _QUICK if self.quick else {}
-        minutes = 0.0 if self.simulated else max(self.wall) / 60
-        limits = {"validation": 64, "budget": budget, "minutes": minutes}
+        limits = {"validation": 64, "budget": max(self.simulated)}
         return kind(**{**COUNTS[count], **limits, **options, **diagonal, **sizes}, setting=setting)
 
     def _compete(self, folder: Path, count: int) -> xr.Dataset:
@@ -229,9 +222,8 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
 
         with ThreadPoolExecutor(len(labels)) as threads:
             curves = list(threads.map(run, questions, folders))
-        budgets = [(name, amount) for name in BUDGETS for amount in getattr(self, name)]
         start, domain = problem(count)
-        best = [best_within(x, *y) for x in curves for y in budgets]
+        best = [best_within(x, budget) for x in curves for budget in self.simulated]
         columns = [x for x in best[0].index if x.startswith("params.")]
         values = np.array([row[columns] for row in best], float)
         _, firsts, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
@@ -239,33 +231,32 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
         options = {"split": "test", "setting": self.setting, "progress": False}
         robot = COUNTS[count].get("robot")
         scores = evaluate([start, *chosen], domain, self.worlds, robot=robot, **options)
-        dims, shape = ("seed", "method"), (len(self.seeds), len(self.methods))
-        generations = np.reshape([len(curve) for curve in curves], shape)
-        variables: dict[str, Any] = {"generations": (dims, generations)}
+        coords = {"seed": self.seeds, "method": self.methods, "budget": self.simulated}
+        dims, shape = (*coords,), (*map(len, coords.values()),)
+        wall = np.reshape([row.wall for row in best], shape)
+        variables: dict[str, Any] = {"wall": (dims, wall)}
         for name in SCORES:
             first, *tuned = scores[name].values.astype(np.float32)
-            by_budget = np.array(tuned)[inverse.ravel()].reshape(*shape, len(budgets), -1)
+            by_budget = np.array(tuned)[inverse.ravel()].reshape(*shape, -1)
             variables[f"start_{name}"] = ("world", first)
-            variables[name] = ((*dims, "budget", "world"), by_budget)
-        names = [f"{name} {amount:g} s" for name, amount in budgets]
-        coords = {"seed": list(self.seeds), "method": list(self.methods), "budget": names}
-        return xr.Dataset(variables, coords)
+            variables[name] = ((*dims, "world"), by_budget)
+        return xr.Dataset(variables, {name: list(x) for name, x in coords.items()})
 
     def intro(self, results: xr.Dataset) -> str:
         """Return the budgets."""
         return (
-            f"Tunings from the paper's parameters, with budgets of wall time without compilation "
-            f"or of simulated time; success in {self.worlds:,} worlds that no tuning has met."
+            f"Tunings from the paper's parameters, with budgets of simulated time; success in "
+            f"{self.worlds:,} worlds that no tuning has met."
         )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the success of the tunings."""
         rows = table(results)
-        picture = Picture(self.file.removeprefix("gradients_"), partial(draw, rows))
         several = results.sizes["count"] > 1
+        picture = Picture("race", partial(draw, rows)) if several else None
         columns = [
             {"name": "parameters", "merge": True},
-            {"name": "equal", "merge": True},
+            {"name": "simulated", "merge": True},
             {"name": "method"},
             {"name": "success", "format": "{:.1f} %", "rest": " [{:.1f}, {:.1f}]"},
             {
@@ -280,10 +271,13 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
                 "rest": " [{:+.3f}, {:+.3f}]",
             },
             {"name": "by seed"},
-            {"name": "generations"},
+            {"name": "wall time", "format": "{:.0f} s"},
         ]
-        text = "Square brackets: 95 % intervals over the seeds, by Student's t."
-        named = {"name": self.file, "title": "Success", "picture": picture if several else None}
+        text = (
+            "Square brackets: 95 % intervals over the seeds, by Student's t. Wall time is without "
+            "compilation."
+        )
+        named = {"name": "gradients_race", "title": "Success", "picture": picture}
         return [Table(rows, text, columns, **named)]
 
 
@@ -296,19 +290,17 @@ def check_counts(counts: Sequence[int]) -> None:
         errors.check_name("count", str(count), [str(x) for x in COUNTS])
 
 
-def spent(curve: pd.DataFrame, budget: str) -> Any:
-    """Return what the vector of each generation of a log has cost: all generations before it [s].
+def best_within(curve: pd.DataFrame, budget: float) -> pd.Series:
+    """Return the generation with the best validation within a budget of simulated time [s].
 
-    Its own trials are for the next vector, except for its validation.
+    Its vector has cost all generations before it; its own trials are for the next vector, except
+    for its validation. `wall` is the wall time of the generations within the budget [s].
     """
-    column = curve["run" if budget == "wall" else "simulated"].to_numpy()
-    return pd.Series(column, curve.index).cumsum().shift(fill_value=0)
-
-
-def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
-    """Return the generation with the best validation within a budget."""
-    within = curve[spent(curve, budget) <= amount]
-    return within.iloc[int(np.nanargmin(within.validation))]
+    spent = curve[["simulated", "run"]].cumsum().shift(fill_value=0)
+    within = spent.simulated <= budget
+    best = curve[within].iloc[int(np.nanargmin(curve[within].validation))].copy()
+    best["wall"] = spent.run[within].max()
+    return best
 
 
 def problem(count: int) -> tuple[Any, str]:
@@ -339,26 +331,18 @@ def table(results: xr.Dataset) -> list[list[Any]]:
         of_count = results.sel(count=count)
         if budget == results.budget.values[0]:
             success, score = (float(of_count[f"start_{x}"].mean()) for x in SCORES)
-            rows.append([str(count), "", "start", 100 * success, None, score, None, "", ""])
-        means = of_count[[*SCORES]].sel(budget=budget).mean("world").transpose("method", "seed")
-        by_method = dict(
-            zip(map(str, means.method.values), 100 * means.success.values, strict=True)
-        )
-        scores = dict(zip(by_method, means.score.values, strict=True))
-        name, amount, unit = str(budget).split()
-        for method, success in by_method.items():
-            ahead = lower = None
-            if method != FIRST and FIRST in by_method:
-                ahead, lower = (
-                    mean_interval(by_method[FIRST] - success),
-                    mean_interval(scores[method] - scores[FIRST]),
-                )
+            rows.append([str(count), "", "start", 100 * success, None, score, None, "", None])
+        means = of_count[[*SCORES, "wall"]].sel(budget=budget).mean("world")
+        methods = {str(x): means.sel({"method": x}) for x in means.method.values}
+        for method, chosen in methods.items():
+            success, ahead, lower = 100 * chosen.success.values, None, None
+            if method != FIRST and FIRST in methods:
+                ahead = mean_interval(100 * methods[FIRST].success.values - success)
+                lower = mean_interval((chosen.score - methods[FIRST].score).values)
+            cells = [mean_interval(success), ahead, float(chosen.score.mean()), lower]
             seeds = ", ".join(f"{x:.1f}" for x in success)
-            chosen = of_count.sel({"method": method})  # `method` is an argument of `sel`
-            label = f"{name} time, {float(amount):,g} {unit}"
-            cells = [mean_interval(success), ahead, float(scores[method].mean()), lower, seeds]
-            generations = f"{float(chosen.generations.mean()):.0f}"
-            rows.append([str(count), label, method, *cells, generations])
+            wall = float(chosen.wall.mean())
+            rows.append([str(count), f"{budget:,g} s", method, *cells, seeds, wall])
     return rows
 
 
@@ -376,7 +360,10 @@ def draw(rows: Sequence[Sequence[Any]]) -> Figure:
             marks = {"marker": "o", "markersize": 3, "capsize": 2}
             ax.errorbar(counts * 1.08**at, mean, error, label=method, **marks)
         ax.set(
-            xscale="log", xlabel="tuned parameters", ylabel="success [%]", title=f"equal {budget}"
+            xscale="log",
+            xlabel="tuned parameters",
+            ylabel="success [%]",
+            title=f"{budget} simulated",
         )
         ax.grid(alpha=0.3)
     handles = axes[0, 0].get_legend_handles_labels()

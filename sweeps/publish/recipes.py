@@ -391,22 +391,12 @@ RECIPES: dict[str, Recipe] = {
         f"rps sweeps/gradients/direction.py --counts 6 64 2048 --truth 4096 {_MACHINE}", cores=15
     ),
     "gradients_race": recipe(f"rps sweeps/gradients/race.py {_MACHINE}", cores=240),
-    "gradients_race_wall": recipe(
-        "rps sweeps/gradients/race.py --counts 6 13 64 512 2048 --simulated --wall 10 "
-        f"--file gradients_race_wall {_MACHINE}",
-        cores=40,
-    ),
     "gradients_tables": recipe(
         *_each(f"{_TABLES}:{{0}} --domain hostile {_HOSTILE} --out runs/{{0}}", *_PLUS_TABLES),
         "rps ladder --domain wide hostile --worlds 10000 --seed 69 --laws rps_plus "
         + " ".join(f"sweeps/gradients/tables.py:{x},runs/{x}/tuned.json" for x in _PLUS_TABLES),
         cores=60,
         section=rows.comparison,
-    ),
-    "gradients_race_18": recipe(
-        "rps sweeps/gradients/race.py --counts 18 --methods derivatives evolution --simulated "
-        f"--wall 30 60 120 --file gradients_race_18 {_MACHINE}",
-        cores=40,
     ),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     **dict.fromkeys(
