@@ -65,10 +65,7 @@ STALE: dict[str, str] = {
         ("engines_ideal", "engines_wide", "tasks_parity"),
         "objects got supports, with other last bits of C MuJoCo",
     ),
-    **dict.fromkeys(
-        ("ceiling", "plus", "saturation", "tuned"),
-        "the ladder, whose small run tells of changes, got more laws",
-    ),
+    "plus": "the ladder, whose small run tells of changes, got more laws",
     **dict.fromkeys(
         (
             "reading_checks",
@@ -113,19 +110,9 @@ STALE: dict[str, str] = {
     ),
     **dict.fromkeys(
         (
-            "bearings",
-            "corridors_failures",
-            "corridors_lookaheads",
-            "corridors_objects",
-            "corridors_open",
-            "corridors_paths",
-            "corridors_widths",
-            "floors_boundaries",
-            "floors_slopes",
             "force_push_paths",
             "grid",
             "headline",
-            "ladder",
             "learned_failures",
             "learned_test",
             "learned_windows",
