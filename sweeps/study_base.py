@@ -208,12 +208,14 @@ class CollectedStudy(Study[xr.Dataset]):
         """Compute the missing parts, or collect the results of other run folders."""
         if not self.runs:
             return super().answer(run)
-        return xr.concat([load(x) for x in self.runs], self.DIMENSION)
+        try:
+            return xr.concat([load(x) for x in self.runs], self.DIMENSION, join="exact")
+        except ValueError as error:
+            raise errors.not_allowed("runs", self.runs, "their options differ") from error
 
     def records(self, run_folder: Path) -> list[Mapping[str, Any]]:
         """Return the provenance of the runs behind the tables."""
-        folders = map(Path, self.runs) if self.runs else [run_folder]
-        return [provenance.read_environment(folder) for folder in folders]
+        return [provenance.read_environment(Path(x)) for x in (*self.runs, run_folder)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -359,20 +361,23 @@ def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, tabl
     Args:
       path: `results/NAME.json` in the folder of a study.
       runs: provenance of the runs behind the table, as `provenance.read_environment` returns it.
+        Where commits or versions differ, also those of a run that was continued, all are written.
       device: device of the runs, in words.
       table: header, rows and note.
     """
-    last = runs[-1]
+    signed = [run for last in runs for run in (*last.get("before", ()), last)]
     with_folders = [run["command"] for run in runs]
     commands = [_without_unread_folder(command, with_folders) for command in with_folders]
     columns, rows = table.columns_and_rows()
     data = {
         "command": [shlex.join(command) for command in commands],
         "device": device,
-        "versions": {name: last["packages"][name] for name in _PACKAGES},
-        "commit": last["commit"],
+        "versions": {
+            name: _all_of([run["packages"][name] for run in signed]) for name in _PACKAGES
+        },
+        "commit": _all_of([x["commit"] for x in signed]),
         "probes": probes.stored_ids(path.stem),
-        "date": last["time"][:10],
+        "date": runs[-1]["time"][:10],
         **({"note": table.note} if table.note else {}),
         "columns": columns,
         "rows": rows,
@@ -380,6 +385,12 @@ def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, tabl
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     return path
+
+
+def _all_of(values: Sequence[Any]) -> Any:
+    """Return the value, or the list of all where they differ."""
+    distinct = list(dict.fromkeys(values))
+    return distinct if len(distinct) > 1 else distinct[0]
 
 
 def split_folder(command: Sequence[str]) -> tuple[list[str], str]:

@@ -134,6 +134,20 @@ def test_a_data_file_has_its_commands_without_local_paths(tmp_path):
         assert "--out /" not in path.read_text(), path
 
 
+def test_a_data_file_has_the_commits_of_all_parts(tmp_path):
+    """Also of a part that another commit began."""
+    packages = dict.fromkeys(_PACKAGES, "1")
+    run = {"packages": packages, "time": "2026-01-01", "command": ["rps", "x"], "commit": "a"}
+    begun, new = run | {"before": [run | {"commit": "b"}]}, packages | {"jax": "2"}
+    path = tmp_path / "results" / "x.json"
+    for runs, commit, jax in (
+        ([run, run], "a", "1"),
+        ([begun, run | {"packages": new}], ["b", "a"], ["1", "2"]),
+    ):
+        data = json.loads(write_table(path, runs, "a core", Table([["x"]])).read_text())
+        assert (data["commit"], data["versions"]["jax"]) == (commit, jax)
+
+
 def test_a_copy_of_a_shipped_policy_does_not_change_its_law(tmp_path):
     shutil.copy(policy.SHIPPED["learned_small"], tmp_path / "copy.npz")
     params = registry.params_to_json(registry.LAWS["learned_small"])

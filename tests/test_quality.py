@@ -7,7 +7,11 @@ import xarray as xr
 from helpers import observation
 from numpy.testing import assert_allclose
 
+from rps_jax import InputError
 from rps_jax.laws import law_of, resolve_law
+from rps_jax.questions import Run
+from rps_jax.trials.progress import no_progress
+from sweeps import study_base
 from sweeps.gradients import race
 
 
@@ -41,6 +45,13 @@ def test_the_table_has_intervals_over_the_seeds():
     assert_allclose(first[3], [87.5, 87.5 - half, 87.5 + half], rtol=1e-4)
     assert first[5:] == [0.125, None, "75.0, 100.0", 6.0]
     assert_allclose(second[4:7:2], [[25.0] * 3, [0.25] * 3])
+
+
+def test_runs_of_other_budgets_are_not_joined(monkeypatch):
+    parts = {"a": 1e5, "b": 2e5}
+    monkeypatch.setattr(study_base, "load", lambda x: xr.Dataset(coords={"budget": [parts[x]]}))
+    with pytest.raises(InputError, match=r"runs = .* options differ"):
+        race.Race(runs=("a", "b")).answer(Run(None, no_progress))
 
 
 @pytest.mark.parametrize(("name", "law"), [("Table64", "rps"), ("Plus64", "rps_plus")])

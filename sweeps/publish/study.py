@@ -164,11 +164,13 @@ def _description(path: Path, checked: bool) -> dict[str, str]:
     """Return version, commit, date, state and duration of a data file, in words."""
     data = json.loads(path.read_text())
     recipe = next((r for name, r in RECIPES.items() if fnmatch.fnmatch(path.stem, name)), None)
+    commits = data.get("commit") or ""
+    commits = [commits] if isinstance(commits, str) else commits
     minutes = (recipe.two_cores, recipe.one_gpu) if recipe else (None, None)
     cores, gpu = ("" if t is None else f"{t:g} min" for t in minutes)
     return {
         "version": str(data.get("versions", {}).get("rps_jax", "")),
-        "commit": str(data.get("commit") or "")[:8],
+        "commit": ", ".join(x[:8] for x in commits),
         "date": str(data.get("date") or ""),
         "computed on": recipe.device if recipe else "",
         "two cores": cores,
