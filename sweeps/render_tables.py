@@ -102,8 +102,6 @@ STALE: dict[str, str] = {
             "fit_one_push",
             "gradients_direction",
             "gradients_race",
-            "gradients_race_18",
-            "gradients_race_wall",
             "gradients_stiff",
         ),
         "a sum in the solver got its former order back, with other last bits",

@@ -125,7 +125,7 @@ class Study(Question[T]):
     machine: str = ""
     """Machine that runs the study, in words; with it the tables are published."""
 
-    CHOICES: ClassVar[Mapping[str, Collection[str]]] = {}  # known names of fields
+    CHOICES: ClassVar[Mapping[str, Collection[Any]]] = {}  # known names of fields
     DIMENSION: ClassVar[str] = ""  # along which the parts are joined
     GROWS: ClassVar[tuple[str, ...]] = ()  # options that may change when a run is continued
     PRESETS: ClassVar[Mapping[str, Any]] = {}  # physics and laws that code names, not options
@@ -162,7 +162,7 @@ class Study(Question[T]):
             value = getattr(self, field)
             values = [value] if isinstance(value, str) else value
             for name in values:
-                errors.check_name(field, name, known)
+                errors.check_name(field, str(name), [*map(str, known)])
             if value != getattr(type(self)(), field):  # some defaults are empty: all names
                 errors.check_each_once(field, values)
 

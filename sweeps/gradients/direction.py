@@ -21,7 +21,7 @@ from rps_jax.runs.question import SimulationQuestion
 from rps_jax.tuning import gradients
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
-from sweeps.gradients.race import COUNTS, Lockstep, PacedGrad, check_counts
+from sweeps.gradients.race import COUNTS, Lockstep, PacedGrad
 from sweeps.study_base import Parts, Study, Table, mean_interval
 
 
@@ -35,22 +35,18 @@ class Direction(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Directions of derivatives and slopes"
+    CHOICES: ClassVar = {"counts": COUNTS}
     DIMENSION: ClassVar[str] = "count"
     GROWS: ClassVar[tuple[str, ...]] = ("counts",)
     REPORTS_TIMES: ClassVar[bool] = True
 
-    counts: tuple[int, ...] = (6, 13, 64, 512, 2048)
+    counts: tuple[int, ...] = (6, 64)
     """Numbers of tuned parameters, as of `race.py`."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the estimates."""
-    truth: int = option(16_384, 8, 10_000_000)
+    truth: int = option(4096, 8, 10_000_000)
     """Number of worlds of the truth."""
     setting: Setting = field(default=Setting(rules=Rules(horizon=150.0)), kw_only=True)
-
-    def check(self) -> None:
-        """Check that the counts exist."""
-        super().check()
-        check_counts(self.counts)
 
     def parts(self, run: Run) -> Parts:
         """Return the function that measures each count."""

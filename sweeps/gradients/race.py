@@ -19,7 +19,7 @@ import functools
 import itertools
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -43,11 +43,10 @@ from rps_jax.tuning.run import Tuning
 from sweeps.study_base import CollectedStudy, Parts, Table, mean_interval, part_name
 
 FOLDER, DRUMS = "sweeps/gradients", ("random_cylinder",)  # from the root of the repository
-# Options of tunings by the number of tuned parameters: those of RPS or RPS+, or entries of tables.
+# Options of tunings by the number of tuned parameters: those of RPS, or entries of tables.
 COUNTS: dict[int, dict[str, Any]] = {
     6: {"tuned": ("K_h", "K_v", "L", "beta", "l_cr", "d_th")},
     13: {"tuned": ("full",)},
-    18: {"law": "rps_plus", "domain": ("hostile",), "robot": "kairos", "objects": ("random_box",)},
     **{n: {"law": f"{FOLDER}/tables.py:Table{n}", "objects": DRUMS} for n in (64, 512, 2048, 4097)},
 }
 SCORES = "success", "score"  # of a trial in a test world
@@ -64,50 +63,46 @@ class Lockstep:
         self.count = count
         self.device = threading.Lock()  # one tuning differentiates at a time
         self.programs: dict[Callable[..., Any], Any] = {}  # of all tunings
-        self._waiting: list[tuple[Tuning, list[Any], list[Any]]] = []
-        self._changed = threading.Condition()
+        self._waiting: list[tuple[Tuning, list[Any], Future[Any]]] = []
+        self._lock = threading.Lock()
 
     def score(self, question: Tuning, tried: list[Any]) -> tuple[Any, Timing]:
         """Return the scores of candidates, once all tunings ask for some.
 
         A tuning has the share of the wall clock that its trials have of the simulated time.
         """
-        answer: list[Any] = []
-        with self._changed:
+        answer = Future[Any]()
+        with self._lock:
             self._waiting.append((question, tried, answer))
             self._run()
-            self._changed.wait_for(lambda: bool(answer))
-        if isinstance(answer[0], BaseException):
-            raise RuntimeError("the batch of all tunings failed") from answer[0]
-        return answer[0]
+        return answer.result()
 
     def leave(self) -> None:
         """Wait for a tuning less."""
-        with self._changed:
+        with self._lock:
             self.count -= 1
             self._run()
 
     def _run(self) -> None:
-        if not self._waiting or len(self._waiting) < self.count:
+        if len(self._waiting) < max(self.count, 1):
             return
         waiting, self._waiting = self._waiting, []
-        requests = [x for _, tried, _ in waiting for x in tried]
-        question, *_ = (question for question, _, _ in waiting)
+        requests, (question, *_) = [x for _, tried, _ in waiting for x in tried], waiting[0]
         try:
             # Batches of similar sizes run in one program.
             options: Any = {"capacity": lambda trials: 1 << (trials - 1).bit_length()}
             scores, timing = score_candidates(
                 requests, question.setting, question.objective, **options
             )
-            for _, tried, answer in waiting:
-                own, scores = scores[: len(tried)], scores[len(tried) :]
-                time = sum(float(np.sum(x.outcome.time)) for x in own)
-                share = time / max(timing.simulated, 1e-9)
-                answer.append((own, Timing(timing.compile * share, timing.run * share, time)))
         except BaseException as error:
-            for _, _, answer in waiting:
-                answer.append(error)
-        self._changed.notify_all()
+            for *_, answer in waiting:
+                answer.set_exception(error)
+            return
+        for _, tried, answer in waiting:
+            own, scores = scores[: len(tried)], scores[len(tried) :]
+            time = sum(float(np.sum(x.outcome.time)) for x in own)
+            share = time / max(timing.simulated, 1e-9)
+            answer.set_result((own, Timing(timing.compile * share, timing.run * share, time)))
 
 
 class _Paced(Tuning):
@@ -155,7 +150,7 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Derivatives against evolution"
-    CHOICES: ClassVar = {"methods": METHODS}
+    CHOICES: ClassVar = {"methods": METHODS, "counts": COUNTS}
     GROWS: ClassVar[tuple[str, ...]] = ("counts",)
     QUICK: ClassVar[Mapping[str, Any]] = {
         "worlds": 4,
@@ -172,8 +167,8 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     methods: tuple[str, ...] = (FIRST, "slopes", "evolution")
     """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials), or evolution."""
     counts: tuple[int, ...] = (6, 13, 64, 512, 2048, 4097)
-    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, or 64, 512, 2048
-    and 4097 of laws with tables."""
+    """Numbers of tuned parameters: 6 and 13 of RPS, or 64, 512, 2048 and 4097 of laws with
+    tables."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
     simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
@@ -187,7 +182,6 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
 
     def check(self) -> None:
         super().check()
-        check_counts(self.counts)
         errors.check_each_once("simulated", self.simulated)
 
     def parts(self, run: Run) -> Parts:
@@ -229,8 +223,7 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
         _, firsts, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
         chosen = [law_of(best[at], start) for at in firsts]
         options = {"split": "test", "setting": self.setting, "progress": False}
-        robot = COUNTS[count].get("robot")
-        scores = evaluate([start, *chosen], domain, self.worlds, robot=robot, **options)
+        scores = evaluate([start, *chosen], domain, self.worlds, **options)
         coords = {"seed": self.seeds, "method": self.methods, "budget": self.simulated}
         dims, shape = (*coords,), (*map(len, coords.values()),)
         wall = np.reshape([row.wall for row in best], shape)
@@ -284,12 +277,6 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
 race = call_of(Race)
 
 
-def check_counts(counts: Sequence[int]) -> None:
-    """Check that there are problems with these numbers of parameters."""
-    for count in counts:
-        errors.check_name("count", str(count), [str(x) for x in COUNTS])
-
-
 def best_within(curve: pd.DataFrame, budget: float) -> pd.Series:
     """Return the generation with the best validation within a budget of simulated time [s].
 
@@ -306,8 +293,7 @@ def best_within(curve: pd.DataFrame, budget: float) -> pd.Series:
 def problem(count: int) -> tuple[Any, str]:
     """Return the law at the start and the domain of the test worlds of a problem."""
     _, start = resolve_law(COUNTS[count].get("law", "rps"))
-    (domain,), objects = COUNTS[count].get("domain", ("wide",)), COUNTS[count].get("objects", ())
-    return start, ",".join([domain, *(f"objects={name}" for name in objects)])
+    return start, ",".join(["wide", *(f"objects={x}" for x in COUNTS[count].get("objects", ()))])
 
 
 def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:

@@ -399,9 +399,7 @@ RECIPES: dict[str, Recipe] = {
     "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "gradients_mjx": recipe(f"rps sweeps/gradients/mjx.py {_MACHINE}", cores=6),
     "gradients_stiff": recipe(f"rps sweeps/gradients/stiff.py {_MACHINE}", cores=3),
-    "gradients_direction": recipe(
-        f"rps sweeps/gradients/direction.py --counts 6 64 --truth 4096 {_MACHINE}", cores=5
-    ),
+    "gradients_direction": recipe(f"rps sweeps/gradients/direction.py {_MACHINE}", cores=5),
     "gradients_race": recipe(f"rps sweeps/gradients/race.py {_MACHINE}", cores=60),
     "gradients_tables": recipe(
         *_each(f"{_TABLES}:{{0}} --domain hostile {_HOSTILE} --out runs/{{0}}", *_PLUS_TABLES),
