@@ -91,8 +91,6 @@ STALE: dict[str, str] = {
     **dict.fromkeys(
         (
             "drives_learned",
-            "gradients_mjx",
-            "gradients_tables",
             "sb3",
         ),
         "the value function of `rps learn` observes the room to walls",
@@ -101,8 +99,6 @@ STALE: dict[str, str] = {
         (
             "fit_one_push",
             "gradients_direction",
-            "gradients_race",
-            "gradients_stiff",
         ),
         "a sum in the solver got its former order back, with other last bits",
     ),
