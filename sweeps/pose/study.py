@@ -83,7 +83,7 @@ class Poses(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
     """Names of rows."""
     worlds: int = option(10000, 2, 10_000_000)
     """Number of worlds of each row."""
-    setting: Setting = field(default=Setting("fused", seed=290311), kw_only=True)
+    setting: Setting = field(default=Setting("fused", seed=530417), kw_only=True)
 
     @cached_property
     def plans(self) -> dict[str, Plan]:
