@@ -123,6 +123,44 @@ def test_a_law_that_can_declare_is_judged_by_its_word(declared):
     assert bool(aim.success) == declared == bool(progress.declared)
 
 
+def test_the_reference_of_a_turn_is_the_first_flush_face():
+    """The heading of the base counts, from the first step in which the face is flush."""
+    turned = course()._replace(heading=jnp.asarray(1.5), relative=jnp.ones(()))
+    box, progress = fp.rectangle(0.3, 0.3), turned.start()
+
+    def step(tilt, base_yaw, progress, touches=True):
+        normal = unit(base_yaw)
+        at = positions(box, GOAL + 0.3 * normal, base_yaw + tilt, GOAL, touches)
+        at = at._replace(base=jnp.array([0.0, 0.0, base_yaw]))
+        return jitted(PoseCourse.step)(turned, progress, at)
+
+    for tilt, touches in ((0.0, False), (0.3, True), (-0.12, True)):
+        progress, aim = step(tilt, 0.4, progress, touches)
+        assert np.isnan(progress.errors).all()
+        assert not aim.success
+    progress, aim = step(0.05, 0.4, progress)
+    assert float(progress.first) == pytest.approx(0.4)
+    assert float(progress.errors[2]) == pytest.approx(1.5 - 0.05, abs=2e-6)
+    progress, aim = step(0.0, 1.9, progress)
+    assert float(progress.first) == pytest.approx(0.4)
+    assert float(progress.errors[2]) == pytest.approx(0, abs=2e-6)
+    assert aim.success
+    assert aim.relative
+
+
+def test_the_law_finds_a_relative_heading_by_a_flush_face():
+    """Equal pushes: straight ahead until the face is flush, then as with the absolute heading."""
+    setting = Setting("quasistatic", rules=Rules(horizon=250.0))
+    case = {"law": FAST, "target": (1.2, 0.5), "setting": setting}
+    trace = rps_jax.push(task="pose,turn=1.57", **case)
+    yaws = trace.snapshots.qpos[:, 2]
+    assert trace.outcome.success
+    touches = trace.snapshots.reading.contact_type > 0
+    assert_allclose(yaws[: touches.argmax() + 4], 0, atol=1e-5)
+    assert trace.outcome.task["heading_error"] < 0.02
+    assert np.sin(float(trace.outcome.base_pose[2]) - 1.57) == pytest.approx(0, abs=0.03)
+
+
 class WaitParams(NamedTuple):
     wait: float = 1.0  # [s]
     d_success: float = 0.05
@@ -151,6 +189,9 @@ def test_the_word_of_a_law_ends_a_trial(task, registries):
 CASES = {
     "push --task pose,heading=90": "task heading = 90 is not allowed: it is beyond 2 pi: give rad",
     "sweep --task pose,heading=0:7": "task heading = 7 is not allowed: it is beyond 2 pi",
+    "push --task pose,turn=90": "task turn = 90.0 is not allowed: it must be a number and at",
+    "push --task pose,turn=x": "task turn = x is not allowed",
+    "sweep --task pose,turn=1,heading=1": "task heading = 1:1 is not allowed: the task has a turn",
     "push --task pose,d_success=0": "task d_success = 0",
     "push --task pose,yaw_success=0": "task yaw_success = 0",
     "push --task pose --target 0.6 0.1": r"target = \(0.6, 0.1\) m is not allowed: the object st",

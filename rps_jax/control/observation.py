@@ -59,6 +59,10 @@ class Observation(NamedTuple):
     yaw_target: Annotated[
         Scalar | None, Spec("rad", "heading of the goal, the direction of the last push; or None")
     ] = None
+    relative: Annotated[
+        Scalar | None,
+        Spec("1", "1: yaw_target is relative to the face that is first felt flush; or None"),
+    ] = None
 
     def with_base(self, radius: Number | None, robot: Robot | None = None) -> Observation:
         """Return it with the static facts of a base.

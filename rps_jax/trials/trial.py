@@ -326,7 +326,7 @@ def observe(
     positions = positions_of(world, trial.qpos, reading.p_robot_contact, touch, declared)
     task, aim = world.task.step(trial.task, positions)
     aims = {"p_world_target": aim.p_world_target, "yaw_target": aim.yaw_target}
-    observation = observation._replace(**aims)
+    observation = observation._replace(**aims, relative=aim.relative)
     success = aim.success
     if success is None:
         success = touch & (distance < params.d_success) & aim.at_end
