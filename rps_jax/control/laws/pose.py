@@ -306,7 +306,8 @@ def step(
     axle = jnp.asarray(0.0 if touch.axle is None else touch.axle)
     half_length = obs.front
     base, yaw, goal = *filtered_pose(params, state, touch), touch.p_world_target
-    theta, weight = jnp.asarray(touch.yaw_target), jnp.asarray(touch.in_contact)
+    theta = yaw_target = jnp.asarray(touch.yaw_target)
+    weight = jnp.asarray(touch.in_contact)
     leg, oriented, is_relative = state.leg, state.oriented, touch.relative is not None
     if is_relative:  # a leg straight ahead until a face is flush
         theta = jnp.where(oriented | state.touched, state.theta, planar.wrap(yaw - jnp.pi))
@@ -521,7 +522,7 @@ def step(
     twist = Twist(v, v_y, omega).saturate(v_max, omega_max)
     if is_relative:
         orients = feels & ~oriented & ((t_even > _FLUSH) | (state.t_push > _DRUM))
-        theta = jnp.where(orients, planar.wrap(yaw + touch.yaw_target), theta)
+        theta = jnp.where(orients, planar.wrap(yaw + yaw_target), theta)
         oriented, touched, known = oriented | orients, touched & ~orients, known & ~orients
     distance = planar.norm(jnp.stack([way_left, y]))
     details = Details(offset, distance, jnp.zeros_like(distance), face, mode != PUSH)
