@@ -26,7 +26,7 @@ from rps_jax.app.cli import flags
 from rps_jax.questions import Run, call_of, option
 from sweeps.study_base import CollectedStudy, Parts, QuickStudy, Table
 
-# `learned_gru.npz` and `learned_mlp.npz` are the laws of 0.3, with which variants start.
+# Variants start with `learned_gru.npz` and `learned_mlp.npz`, the laws of 0.3, or `learned` of 0.4.
 DOMAINS = ("wide", "hostile", "real")
 SHARED = (
     "rps learn --domain wide hostile real --num-envs 1024 --drawn 8192 --validation 128 --every 1.5"
@@ -36,7 +36,8 @@ SHARED = (
 _WARM = "--initial sweeps/learned/learned_gru.npz --action-std 0.25 --learning-rate 2e-4"
 _LIMITS = "robot_force=150:800,robot_traction=0.3:0.8,robot_lag=0:0.5,robot_acceleration=0.1:1"
 _HARD = f"--domain hostile real hostile,{_LIMITS}"
-_CONTINUED = f"--initial learned --action-std 0.2 --learning-rate 2e-4 {_HARD}"
+_FORMER = "--initial sweeps/learned/learned_0_4.npz --action-std 0.2 --learning-rate 2e-4"
+_CONTINUED = f"{_FORMER} {_HARD}"
 VARIANTS = {  # options after the shared ones
     "scratch": "",
     "warm": _WARM,

@@ -82,7 +82,10 @@ _HARDWARE = {
     "`rps_unsaturated`, ideal": " --law rps_unsaturated --robot ideal",
 }
 _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
+_PRESET = "sweep --domain wide --worlds 1000 --seed 9243"
+_PRESETS = ("turtlebot4", "jackal", "husky", "mir100", "pioneer_3dx")
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
+_FORMER = "sweeps/learned/learned_0_4.npz"  # `learned` of 0.4
 _LEARNED = _each(
     "rps sweep --domain {0} --worlds 10000 --seed 5301 "
     "--laws rps_plus sweeps/learned/learned_gru.npz learned --out runs/learned_{0}",
@@ -364,6 +367,15 @@ RECIPES: dict[str, Recipe] = {
         section="Success",
         columns=_RATES,
     ),
+    "presets": recipe(
+        *_each(f"rps {_PRESET} --robot {{0}} --laws unicycle --out runs/preset_{{0}}", *_PRESETS),
+        f"rps {_PRESET} --robot f1tenth --laws unicycle_car --out runs/preset_f1tenth",
+        f"rps {_PRESET} --robot f1tenth --laws unicycle_car --max-lost 600 --out runs/preset_600",
+        gpu=2,
+        section="Success",
+        labels=(*_PRESETS, "f1tenth", "f1tenth, 600 s without contact"),
+        columns=("", "all", "median time", "timeout", "lost contact"),
+    ),
     "corridors_*": recipe(
         "rps sweeps/corridors --laws rps rps_tuned rps_plus learned force_push dipole aps "
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",
@@ -435,7 +447,7 @@ RECIPES: dict[str, Recipe] = {
     "learned_test": recipe(*_LEARNED, gpu=4, section=rows.beside_first, labels=(*_WIDE, "real")),
     "learned_tasks": recipe(
         *(
-            f"rps sweep {options} --seed 7301 --laws learned sweeps/learned/learned_tasks.npz"
+            f"rps sweep {options} --seed 7301 --laws {_FORMER} learned"
             for options in _BETWEEN_WALLS.values()
         ),
         cores=20,
