@@ -196,28 +196,32 @@ def test_a_hand_turns_the_heading_of_a_goal_and_the_object_arrives_there(paused)
     for (let i = 0; i < arguments[1]; i++) push.step();
     for (let i = 0; i < 40; i++) drawScene(0.1);
     scene.scrollIntoView();
-    const pixels = [tailOf(), turned([-ARROW, 0], -0.6, push.goal)].map((p) => toScreen(v, p));
+    const tail = turned([-ARROW, 0], arguments[2], push.goal);
+    const pixels = [tailOf(), tail].map((p) => toScreen(v, p));
     return [push.options.law, pixels.map(([x, y]) => [x - v.w / 2, y - v.h / 2])];
     """
     finish = """
     while (push.step()) {}
     return [push.options.heading, push.trial.success, push.outcomes, push.remembered];
     """
-    for base, law, steps in (("omni", "pose", 300), ("differential", "pose_drive", 30)):
-        used, pixels = paused.execute_script(prepare, base, steps)
+    for base, law, *inputs in (
+        ("omni", "pose", 300, -0.6),
+        ("differential", "pose_drive", 30, 2.0),
+    ):
+        used, pixels = paused.execute_script(prepare, base, *inputs)
         assert used == law
         (x, y), (to_x, to_y) = np.round(pixels).astype(int).tolist()
         mouse = ActionChains(paused, duration=0)
         mouse.move_to_element_with_offset(paused.find_element(By.ID, "scene"), x, y)
         mouse.click_and_hold().move_by_offset(to_x - x, to_y - y).release().perform()
         heading, success, outcomes, middle = paused.execute_script(finish)
-        assert heading == pytest.approx(-0.6, abs=0.05)
+        assert heading == pytest.approx(inputs[1], abs=0.05)
         assert success
         assert outcomes["heading_error"] < 0.1
         assert np.hypot(*np.subtract(middle, [1.6, 0.3])) < 0.4
-    turn = "push.setGoal({ heading: 2.0, target: [0.8, 0.8] });"
+    turn = "push.setGoal({ heading: 0.3, target: [-1.2, 0.3] });"
     assert paused.execute_script(turn + finish)[1]
-    used, _ = paused.execute_script(prepare, "car", 0)
+    used, _ = paused.execute_script(prepare, "car", 0, 0)
     assert used == "pose"
 
 

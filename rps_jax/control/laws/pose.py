@@ -583,22 +583,25 @@ LAW = Law(
     observe_sent=observe_sent,
     memory=memory,
 )
+_DRIVE = PoseParams(
+    r=0.22,
+    s_min=0.8,
+    s_flush=0.6,
+    s_back=0.15,
+    y_tol=0.02,
+    cap=0.12,
+    K_h=2.0,
+    h_max=0.25,
+    l_edge=0.25,
+    back=0.3,
+    R=0.7,
+    gap=0.3,
+    beyond=0.05,
+    looks=1.0,
+)
 PRESETS = {
     "pose": PoseParams(),
-    "pose_drive": PoseParams(  # for bases that cannot move sideways
-        r=0.22,
-        s_min=0.8,
-        s_flush=0.6,
-        s_back=0.15,
-        y_tol=0.02,
-        cap=0.12,
-        K_h=2.0,
-        h_max=0.25,
-        l_edge=0.25,
-        back=0.3,
-        R=0.7,
-        gap=0.3,
-        beyond=0.05,
-        looks=1.0,
-    ),
+    "pose_drive": _DRIVE,  # for bases that cannot move sideways
+    # The same with a narrow front, as 0.3 m of `turtlebot4`.
+    "pose_narrow": _DRIVE._replace(l_edge=0.13, l_turn=0.14, gap=0.15, beyond=0.03),
 }
