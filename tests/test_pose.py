@@ -194,7 +194,7 @@ CASES = {
     "sweep --task pose,heading=0:7": "task heading = 7 is not allowed: it is beyond 2 pi",
     "push --task pose,turn=90": "task turn = 90.0 is not allowed: it must be a number and at",
     "push --task pose,turn=x": "task turn = x is not allowed",
-    "sweep --task pose,turn=1,heading=1": "task heading = 1:1 is not allowed: the task has a turn",
+    "sweep --task pose,turn=1,heading=1": "task heading = 1 to 1 is not allowed: its turn",
     "push --task pose,d_success=0": "task d_success = 0",
     "push --task pose,yaw_success=0": "task yaw_success = 0",
     "push --task pose --target 0.6 0.1": r"target = \(0.6, 0.1\) m is not allowed: the object st",

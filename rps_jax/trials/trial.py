@@ -381,9 +381,9 @@ def perceive(
     if not law.smooth:
         obs = obs._replace(in_contact=measured.reading.contact_type != NONE)
     if law.senses == "pose":
-        obs = PoseObservation(obs, object_pose(judged.qpos)[0], fp.circumradius(world.footprint))
+        radius = fp.circumradius(world.footprint)
         corners = outline(world, judged.qpos).vertices if law.heading else None
-        obs = obs._replace(corners=corners)
+        obs = PoseObservation(obs, object_pose(judged.qpos)[0], radius, corners)
     if law.senses in ("taxels", "ends"):
         skin = world.skin, judged.skin, outline(world, judged.qpos)
         observation = features.OBSERVATIONS[law.senses]

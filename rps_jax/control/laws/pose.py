@@ -185,7 +185,7 @@ class PoseState(NamedTuple):
     looking: Annotated[jax.Array, Spec("1", "whether the base looks for an end")]
     looks: Annotated[jax.Array, Spec("1", "number of looks in this leg")]
     tries: Annotated[jax.Array, Spec("1", "number of repetitions")]
-    theta: Annotated[jax.Array, Spec("rad", "heading of the goal in the world, once known")]
+    goal: Annotated[jax.Array, Spec("m, m, rad", "pose of the goal in the world")]  # (3,)
     oriented: Annotated[jax.Array, Spec("1", "whether a goal's relative heading is known")]
     side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around the object; -1: clockwise")]
     gear: Annotated[jax.Array, Spec("1", "1: forwards around the object; -1: in reverse")]
@@ -216,6 +216,7 @@ def init(params: PoseParams, temperatures: Smooth | None = None) -> PoseState:
         known=sides > 0,
         centred=point > 0,
         twist=sides[:3],
+        goal=sides[:3],
         **dict.fromkeys(names, point),
         **dict.fromkeys(("touched", "looking", "done", "oriented"), no),
         **dict.fromkeys(("side", "gear"), zero + 1),
@@ -310,7 +311,7 @@ def step(
     weight = jnp.asarray(touch.in_contact)
     leg, oriented, is_relative = state.leg, state.oriented, touch.relative is not None
     if is_relative:  # a leg straight ahead until a face is flush
-        theta = jnp.where(oriented | state.touched, state.theta, planar.wrap(yaw - jnp.pi))
+        theta = jnp.where(oriented | state.touched, state.goal[2], planar.wrap(yaw - jnp.pi))
         leg = jnp.where(oriented, leg, 2)
     touches = weight if weight.dtype == bool else weight > 0.5
     u = planar.unit(yaw)
@@ -371,7 +372,7 @@ def step(
     settled = (state.t_push > 2) & has_looked & ((t_even > 1) | (state.t_push > 6))
     room = room_of(way_left)
     is_off = last_leg & feels & settled & may_try
-    is_off = is_off & (jnp.abs(y) > room + 0.01) & (way_left > s_min - 0.1)
+    is_off &= (jnp.abs(y) > room + 0.01) & (way_left > s_min - 0.1)
     at_end = last_leg & feels & (way_left < params.stop)
     # A drum is never flush: a long push and a repetition are enough.
     is_uneven = (t_even < 0.3) & ((state.tries < 1) | (state.t_push < 20))
@@ -398,7 +399,7 @@ def step(
     along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
     middle_across, middle_along = (box_left - box_right) / 2, (ahead - behind) / 2
     wants = (leg % 2 == 0) & feels & ~chooses & (t_even > 0.6) & ~has_looked
-    wants = wants & (~last_leg | (way_left > 0.03)) & (state.t_push > 0.6)
+    wants &= (~last_leg | (way_left > 0.03)) & (state.t_push > 0.6)
     knows_left = _turned(known, leg)[1]
     target = jnp.where(knows_left, -box_right - params.beyond, box_left + params.beyond)
     look = jnp.where(wants, target, state.look)
@@ -419,7 +420,7 @@ def step(
     known, looking = known & ~failed, looking & ~failed
     patience = jnp.where(looks > 0, 0.1, 0.4)
     leaves = (touches & is_bad & (t_push > patience)) | is_lost | failed | turns | wants
-    leaves = pushing & touched & leaves
+    leaves &= pushing & touched
     hits = (state.mode == AROUND) & touches
     lands = hits & on_front & ~is_bad & is_facing & ~turns
     stops = hits & ~lands & (on_front | omni)
@@ -487,11 +488,7 @@ def step(
     turn_left = planar.wrap(psi + steer - yaw)
     arm = half_length + params.r
     curve = jnp.clip(params.K_e * turn_left, -kappa, kappa)
-    v = jnp.where(
-        follows,
-        jnp.minimum(v, params.v_max / jnp.hypot(1.0, curve * arm)),
-        v,
-    )
+    v = jnp.minimum(v, jnp.where(follows, params.v_max / jnp.hypot(1.0, curve * arm), v))
     bound = soft.where(weight, params.omega_push, params.omega_max)
     omega = jnp.where(
         follows, curve * v, jnp.where(touched, jnp.clip(turn_left, -bound, bound), 0.0)
@@ -500,7 +497,7 @@ def step(
     gain = soft.where(weight, params.K_y, 0.5)
     may_slide = omni & touched & (touches | (t_push == 0))
     v_y = jnp.where(may_slide, jnp.clip(gain * lateral, -bound, bound), 0.0)
-    v_y = v_y - jnp.where(follows, omega * arm, 0.0)
+    v_y -= jnp.where(follows, omega * arm, 0.0)
     # Q7 and Q8.
     flee = jnp.array([-1.0, 0.0]) * params.v_free
     if omni:
@@ -546,7 +543,7 @@ def step(
         looking,
         looks,
         tries,
-        theta,
+        jnp.stack([*goal, theta]),
         oriented,
         side,
         gear,
@@ -560,12 +557,12 @@ def is_done(state: PoseState) -> Array:
     return state.done
 
 
-def memory(state: PoseState, goal: np.ndarray) -> Memory:
+def memory(state: PoseState) -> Memory:
     """Return the mode and the middle of the box."""
     mode = ("", *MODES[:2])[int(state.mode)]
     ahead, left, behind, right = state.h
     middle = np.array([ahead - behind, left - right]) / 2
-    middle = goal[:2] + solid.rotate(goal[2:], middle[None])[0]
+    middle = state.goal[:2] + solid.rotate(state.goal[2], middle)
     return Memory(mode, middle) if state.touched else Memory(mode)
 
 

@@ -30,7 +30,7 @@ from rps_jax.geometry.arrays import Array, Float, Floats
 from rps_jax.record.files import Arrays
 from rps_jax.robot.shell import Shell
 from rps_jax.spec import Spec
-from rps_jax.world.quantity import Quantity, Range
+from rps_jax.world.quantity import Quantity, Range, check_unused
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
 
 _SPACING = 0.15  # [m] of way between the stored positions of a cylinder; the heading spans two
@@ -175,9 +175,7 @@ class Pose(Task):
 
     def check(self) -> None:
         """Raise InputError for a heading beside a turn."""
-        if self.idle and self.heading != Pose.heading:
-            rule = "the task has a turn; leave out one of them"
-            raise errors.not_allowed("task heading", self.heading, rule)
+        check_unused(self, "task ", dict.fromkeys(self.idle, "its turn leaves"))
 
     @property
     def shape(self) -> Hashable:
@@ -202,13 +200,11 @@ class Pose(Task):
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, PoseCourse]:
         """Return the goals."""
         heading = self.heading.at(inputs.u["heading"]) + inputs.bearing
-        tolerances = (np.full(heading.shape, x) for x in (self.d_success, self.yaw_success))
-        leaves: Any = (inputs.p_world_target, heading, *tolerances)
-        course = PoseCourse(*leaves)
+        constants = self.d_success, self.yaw_success
         if self.turn is not None:
-            turns: Any = {"heading": 0 * heading + self.turn, "relative": np.ones_like(heading)}
-            course = course._replace(**turns)
-        return inputs.p_world_target, course
+            heading, constants = np.full_like(heading, self.turn), (*constants, 1.0)
+        leaves: Any = (inputs.p_world_target, heading, *(0 * heading + x for x in constants))
+        return inputs.p_world_target, PoseCourse(*leaves)
 
 
 TASK = Pose
