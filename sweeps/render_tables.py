@@ -111,14 +111,12 @@ STALE: dict[str, str] = {
     **dict.fromkeys(
         (
             "force_push_paths",
-            "grid",
             "headline",
             "learned_failures",
             "learned_test",
             "learned_windows",
             "million",
             "models",
-            "regression",
         ),
         "`learned` was trained between walls, too",
     ),
