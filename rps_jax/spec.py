@@ -25,43 +25,10 @@ T = TypeVar("T")
 SPEC = "spec"  # key in the metadata of a field of a dataclass
 LIMITS = ("ge", "gt", "le", "lt")  # at least, above, at most, below; names of `annotated_types`
 # Symbols of units; a unit is a product or quotient of their powers, as kg m^2 or m/s^2.
-SYMBOLS = frozenset(
-    [
-        "1",
-        "%",
-        "m",
-        "mm",
-        "km",
-        "in",
-        "rad",
-        "deg",
-        "s",
-        "ms",
-        "us",
-        "ns",
-        "min",
-        "h",
-        "d",
-        "g",
-        "kg",
-        "t",
-        "N",
-        "J",
-        "W",
-        "Hz",
-        "kHz",
-        "GHz",
-        "V",
-        "F",
-        "pF",
-        "bytes",
-        "kB",
-        "MB",
-        "GB",
-        "px",
-        "frame",
-    ]
-)
+_SYMBOLS = """
+1 % m mm km in rad deg s ms us ns min h d g kg t N J W Hz kHz GHz V F pF bytes kB MB GB px frame
+"""
+SYMBOLS = frozenset(re.findall(r"\S+", _SYMBOLS))
 _FACTOR = re.compile(r"([A-Za-z%1]+)(\^-?\d+)?")
 
 
@@ -151,17 +118,11 @@ class Spec:
 
 
 @dataclass(frozen=True)
-class Choices:
-    """Allowed texts of a field, from a registry that programs extend."""
-
-    names: Callable[[], tuple[str, ...]]
-
-
-@dataclass(frozen=True)
 class Named:
-    """Names that texts of a type may begin with, from a registry; help lists them."""
+    """Names with which texts of a type begin, from a registry that programs extend."""
 
     names: Callable[[], Iterable[str]]
+    closed: bool = False  # whether no other text is allowed
 
 
 def annotation_in(hint: Any, kind: type[T]) -> T | None:

@@ -14,7 +14,7 @@ from rps_jax.engines.base import Engine
 from rps_jax.record import options
 from rps_jax.record.files import JsonObject
 from rps_jax.robot.robot import Robot
-from rps_jax.spec import Choices
+from rps_jax.spec import Named
 from rps_jax.trials.trial import Rules
 from rps_jax.world import physics as physics_
 from rps_jax.world.domain import Domain
@@ -60,7 +60,7 @@ class Setting:
       InputError: an engine, physics, rules or seed that are not valid, or not together.
     """
 
-    engine: Annotated[str, Choices(engines.names)] = "fused"
+    engine: Annotated[str, Named(engines.names, closed=True)] = "fused"
     """What steps the worlds: mjx (MuJoCo's equations in JAX), fused (the same equations,
     specialised to these scenes: the fastest, with exact derivatives), mujoco (C MuJoCo, on all
     cores) or quasistatic (planar, without inertia; its derivatives are those of that model)."""
