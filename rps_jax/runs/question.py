@@ -123,9 +123,9 @@ class Command(Generic[T]):
 
     out: Path | str | None = None
     """Run folder, in the shell by default runs/NAME; a run that was killed is continued there."""
-    progress: bool | None = option(None, kw_only=True, hidden=True)
+    progress: bool | None = option(None, hidden=True)
     """Whether a bar shows the progress; by default in a terminal and in a notebook."""
-    report_to: ProgressCallback | None = option(None, kw_only=True, hidden=True)
+    report_to: ProgressCallback | None = option(None, hidden=True)
     """Callback that receives the progress instead of a bar."""
 
     QUICK: ClassVar[Mapping[str, object]] = {}  # values of `quick`, by the field's name
@@ -358,7 +358,7 @@ class Question(Command[T]):
 class BagQuestion(Question[T]):
     """Base class of questions that read bags."""
 
-    topics: TopicsLike = option((), kw_only=True, flag="topic")
+    topics: TopicsLike = option((), flag="topic")
     """Topic of a bag that has another name, as odom=/ridgeback/odom; the option may be repeated.
     The keys are odom, target, path, contact, taxels, force, object, cmd_vel, tf and tf_static. In
     Python a dict: topics={"odom": "/ridgeback/odom"}."""
@@ -384,9 +384,9 @@ class QuickQuestion(Question[T]):
 class TrialQuestion(QuickQuestion[T]):
     """Base class of questions that run trials."""
 
-    slots: int | None = option(None, 1, 10_000_000, kw_only=True)
+    slots: int | None = option(None, 1, 10_000_000)
     """Number of worlds that one worker steps at once; by default as suits engine and device."""
-    workers: int | None = option(None, 1, 1024, kw_only=True)
+    workers: int | None = option(None, 1, 1024)
     """Number of host threads that step worlds; by default as suits engine and device."""
 
     IGNORED_FIELDS = ("slots", "workers")
