@@ -231,7 +231,7 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
         texts[name] = str(file.get(name, allowed[0])).lower().removesuffix(".0")
         if texts[name] not in allowed:
             raise errors.not_allowed(f"task {name}", file[name], f"give one of {list(allowed)}")
-    shades = _shades(Path(str(file.get("image", "an image"))))[::-1]
+    shades = shades_of(file)
     occupied = shades if texts["negate"] in ("1", "true") else 1 - shades
     # Unknown cells, and those outside, are walls.
     free = (occupied < low) & (occupied <= high)
@@ -280,8 +280,9 @@ def _warn_once(sentence: str) -> None:
     warnings.warn(sentence, stacklevel=3)
 
 
-def _shades(path: Path) -> np.ndarray:
-    """Return the brightness (rows, columns) of an image, from 0 to 1."""
+def shades_of(file: Mapping[str, Any]) -> np.ndarray:
+    """Return the brightness (rows from below, columns) of the image of a map, from 0 to 1."""
+    path = Path(str(file.get("image", "an image")))
     content = io.BytesIO(files.read_regular(path, "image"))
     try:
         with warnings.catch_warnings(action="ignore"):  # a large image is an error
@@ -289,9 +290,9 @@ def _shades(path: Path) -> np.ndarray:
         if image.width * image.height > _MAX_PIXELS:
             raise ValueError(f"it has {image.width} x {image.height} pixels")
         if image.mode.startswith("I"):
-            return np.asarray(image) / 65535
+            return np.asarray(image)[::-1] / 65535
         colours = image.convert("RGBA" if image.has_transparency_data else "RGB")
-        return np.asarray(colours).mean(axis=2) / 255
+        return np.asarray(colours)[::-1].mean(axis=2) / 255
     except Exception as error:  # of any kind, by Pillow on damaged files
         rule = f"give a PGM, PNG or BMP file of at most 16 million pixels ({error})"
         raise errors.not_allowed("task image", path, rule) from error
