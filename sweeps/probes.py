@@ -112,12 +112,9 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "ceiling": ("ladder", "ceiling"),
     **dict.fromkeys(("ladder", "bearings", "plus", "saturation", "tuned"), ("ladder", *_TRIALS)),
     "rivals_tuned": ("ladder", "tune_es"),
-    "landscape": ("wide", "hostile", "tune_es"),
     **dict.fromkeys(
         ("learned_test", "learned_tasks", "learned_failures", "sb3"), ("hostile", "learn")
     ),
-    **dict.fromkeys(("learned_variants", "learned_continued"), ("hostile", "learn")),
-    "mends": ("wide", "hostile", "tune_es"),
     **dict.fromkeys(("limits", "sizes"), ("wide", "hostile")),
     **dict.fromkeys(("plans", "replans"), ("quasistatic",)),
     "feet": ("wide", "feet"),
