@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-__version__ = "0.5.0.dev0"
+__version__ = "0.5.0"
 
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
 _HOMES = {name: home for home, name in re.findall(r"^from (\S+) import (\w+) as", _STUB, re.M)}

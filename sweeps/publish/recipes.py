@@ -82,6 +82,8 @@ _HARDWARE = {
     "`rps_unsaturated`, ideal": " --law rps_unsaturated --robot ideal",
 }
 _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
+_PRESET = "sweep --domain wide --worlds 1000 --seed 9243"
+_PRESETS = ("turtlebot4", "jackal", "husky", "mir100", "pioneer_3dx")
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
 _LEARNED = _each(
     "rps sweep --domain {0} --worlds 10000 --seed 5301 "
@@ -331,6 +333,15 @@ RECIPES: dict[str, Recipe] = {
         gpu=8,
         section="Success",
         columns=_RATES,
+    ),
+    "presets": recipe(
+        *_each(f"rps {_PRESET} --robot {{0}} --laws unicycle --out runs/preset_{{0}}", *_PRESETS),
+        f"rps {_PRESET} --robot f1tenth --laws unicycle_car --out runs/preset_f1tenth",
+        f"rps {_PRESET} --robot f1tenth --laws unicycle_car --max-lost 600 --out runs/preset_600",
+        gpu=2,
+        section="Success",
+        labels=(*_PRESETS, "f1tenth", "f1tenth, 600 s without contact"),
+        columns=("", "all", "median time", "timeout", "lost contact"),
     ),
     "corridors_*": recipe(
         "rps sweeps/corridors --laws rps rps_tuned rps_plus learned force_push dipole aps "

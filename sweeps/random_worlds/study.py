@@ -58,7 +58,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
     """Number of worlds of a domain."""
     panel: int = option(2_000, 0, 10_000_000)
     """Number of these worlds that are run with each model of the panel."""
-    in_c: int = option(1_000, 0, 10_000_000)
+    in_c: int = option(400, 0, 10_000_000)
     """Number of these worlds that are run in C MuJoCo."""
     only: tuple[str, ...] = ()
     """Models to run now, as "C MuJoCo*" or "quasi-static"; by default all. A GPU and processors can
