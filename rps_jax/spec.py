@@ -103,7 +103,7 @@ class Spec:
         """Attributes of a variable of a dataset."""
         return {"units": self.unit or "1"} | ({"long_name": self.about} if self.about else {})
 
-    def check(self, name: str, value: Any) -> float:
+    def check(self, name: str, value: object) -> float:
         """Return a value as a float if it is within the limits, or raise InputError.
 
         It must be finite, unless infinity is a limit.
@@ -125,14 +125,14 @@ class Named:
     closed: bool = False  # whether no other text is allowed
 
 
-def annotation_in(hint: Any, kind: type[T]) -> T | None:
+def annotation_in(hint: object, kind: type[T]) -> T | None:
     """Return the annotation of a kind of a type, of an alternative of it, or of its items."""
     metadata = getattr(hint, "__metadata__", ())
     inner = (annotation_in(x, kind) for x in typing.get_args(hint) if not metadata)
     return next((x for x in (*metadata, *inner) if isinstance(x, kind)), None)
 
 
-def spec_of(annotation: Any) -> Spec | None:
+def spec_of(annotation: object) -> Spec | None:
     """Return the declaration in an annotation, with the limits that stand beside it."""
     metadata = getattr(annotation, "__metadata__", ())
     spec = next((x for x in metadata if isinstance(x, Spec)), None)
@@ -148,7 +148,7 @@ def spec_of(annotation: Any) -> Spec | None:
     return dataclasses.replace(spec, **limits) if limits else spec
 
 
-def _texts_of(kind: type) -> Mapping[str, Any]:
+def _texts_of(kind: type) -> Mapping[str, str]:
     if sys.version_info < (3, 14):
         return inspect.get_annotations(kind)
     import annotationlib  # pyright: ignore[reportMissingImports]
@@ -157,7 +157,7 @@ def _texts_of(kind: type) -> Mapping[str, Any]:
 
 
 @functools.cache
-def _annotations_of(kind: type) -> dict[str, Any]:
+def _annotations_of(kind: type) -> dict[str, object]:
     """Return the annotations of a class.
 
     A class without declarations may have annotations of names that do not exist at run time.

@@ -387,7 +387,7 @@ def params_to_json(params: LawParams) -> JsonObject:
     return {"law": kind.__name__} | _SOURCES.get(kind, {}) | leaves_to_json(params)
 
 
-def params_from_json(values: Mapping[str, Any], run: Path | None = None) -> LawParams:
+def params_from_json(values: JsonObject, run: Path | None = None) -> LawParams:
     """Return the parameters that `params_to_json` wrote.
 
     A law whose file has changed is loaded from its copy in the folder of the run.

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args, get_origin
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.record import files
@@ -90,7 +91,7 @@ def check_arguments(function: Callable[..., object], values: Mapping[str, object
         _check(name, value, field_types(function)[name], None)
 
 
-def _check(name: str, value: Any, kind: Hint, spec: Spec | None) -> None:
+def _check(name: str, value: object, kind: Hint, spec: Spec | None) -> None:
     """Check a value by its type, and by the limits of its declaration."""
     kinds = _alternatives(kind)
     if value is None and type(None) in kinds:
@@ -156,7 +157,7 @@ def _is_of(value: Any, kind: Hint) -> bool:
     return isinstance(value, bare)
 
 
-def _has_items(value: Any) -> bool:
+def _has_items(value: ArrayLike) -> bool:
     return isinstance(value, Sequence) or (hasattr(value, "__iter__") and np.ndim(value) > 0)
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from rps_jax import engines, errors
 from rps_jax.control import registry
@@ -144,10 +144,10 @@ class Setting:
         return {"physics": physics, "rules": rules} | self.attributes
 
     @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> Setting:
+    def from_json(cls, record: JsonObject) -> Setting:
         """Return the setting of a record with the fields of `to_json`."""
         fields = dict(record["physics"]).items()
-        values: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in fields}
+        values: JsonObject = {k: tuple(x) if isinstance(x, list) else x for k, x in fields}
         physics, rules = Physics(**values), Rules(**record["rules"])
         seed, split = record["seed"], record.get("split")
         return cls(record["engine"], physics, rules=rules, seed=seed, split=split)
