@@ -229,21 +229,13 @@ class Command(Generic[T]):
         return next((value for value in vars(self).values() if isinstance(value, Setting)), None)
 
 
-def quick_command(command: C) -> C:
-    """Return a command with its quick values for options at their defaults."""
-    quick, default = command, type(command)()
+def quick_command(command: C, changed: C) -> C:
+    """Return a changed command with the quick values of another for options at their defaults."""
+    default = type(command)()
     for name, value in command.quick_values().items():
-        if attrgetter(name)(command) == attrgetter(name)(default):
-            quick = _replace_field(quick, name, value)
-    return quick
-
-
-def quick_defaults(command: C) -> C:
-    """Return the defaults of a command, with its quick values."""
-    defaults = type(command)()
-    for name, value in command.quick_values().items():
-        defaults = _replace_field(defaults, name, value)
-    return defaults
+        if attrgetter(name)(changed) == attrgetter(name)(default):
+            changed = _replace_field(changed, name, value)
+    return changed
 
 
 def _replace_field(record: D, name: str, value: object) -> D:
@@ -374,7 +366,7 @@ class QuickQuestion(Question[T]):
     IGNORED_FIELDS = ("quick",)
 
     def with_quick_values(self) -> Self:
-        return quick_command(self) if self.quick else self
+        return quick_command(self, self) if self.quick else self
 
     def quick_note(self) -> str:
         return quick_note(self) if self.quick else ""
