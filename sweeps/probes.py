@@ -39,6 +39,8 @@ _FLOAT = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _BOX = "wide,objects=random_box"
 _SHORT = "--horizon 20"
 _FAST = "sweep --worlds 24 --laws rps_tuned rps_plus"
+# A network whose weights stay, when those of `learned` change.
+_NETWORK = _SWEEPS / "learned" / "learned_0_4.npz"
 
 # Commands of the probes, by name. A command may read the run folder of an earlier probe.
 PROBES = {
@@ -49,15 +51,16 @@ PROBES = {
     "push_quasistatic": "push --object box --target 0.6 0 --engine quasistatic --no-video",
     "hardware": "hardware --quick --engine fused --horizon 20 --shifts 0.1",
     "wide": f"{_FAST} rps nps aps --domain wide --horizon 60",
-    "hostile": "sweep --worlds 24 --laws rps aps learned --domain hostile --horizon 60",
+    "hostile": f"sweep --worlds 24 --laws rps aps {_NETWORK} --domain hostile --horizon 60",
+    "learned": "sweep --worlds 24 --laws learned --domain hostile --horizon 60",
     "real": f"sweep --worlds 32 --laws rps_tuned force_push --domain real {_SHORT}",
     "prisms": f"sweep --worlds 32 --laws rps_tuned dipole --domain prisms {_SHORT}",
     "feet": f"{_FAST} --domain wide,feet=0.5:0.9 --horizon 60",
     "round": f"{_FAST} --domain wide --robot round {_SHORT}",
     "drives": f"sweep --worlds 24 --laws unicycle --robot ideal,drive=differential {_SHORT}",
     "pose": f"sweep --worlds 16 --laws pose --task pose --domain {_BOX} --horizon 60",
-    "path": f"{_FAST} learned --task path {_SHORT}",
-    "corridor": f"{_FAST} learned --task corridor {_SHORT}",
+    "path": f"{_FAST} {_NETWORK} --task path {_SHORT}",
+    "corridor": f"{_FAST} {_NETWORK} --task corridor {_SHORT}",
     "floor": f"{_FAST} --domain wide,slope=0:0.05,boundary_factor=1:2 {_SHORT}",
     "mujoco": f"sweep --worlds 12 --laws rps rps_tuned --engine mujoco {_SHORT}",
     "mjx": f"sweep --worlds 8 --laws rps --engine mjx --domain {_BOX} --horizon 1",
@@ -82,15 +85,18 @@ _TRIALS = ("wide", "hostile", "real")
 # Probes of each data file, by the first pattern that its name has. A measured time has none.
 PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "table_mjx": ("table_mjx",),
-    **dict.fromkeys(("table", "grid"), ("table",)),
+    "table": ("table",),
+    "grid": ("table", "learned"),
     **dict.fromkeys(("gazebo*", "readings*", "fidelity", "rest"), ("table", "push_mujoco")),
     **dict.fromkeys(("hardware", "shoves", "reading_*"), ("hardware",)),
-    "corridors_*": ("path", "corridor", "tune_es"),  # lookaheads are chosen in worlds of tuners
+    # Lookaheads are chosen in worlds of tuners.
+    "corridors_*": ("path", "corridor", "tune_es", "learned"),
     "tuned_for_corridors": ("wide", "real"),
     "tasks_parity": ("path", "corridor", "mujoco", "mjx"),
-    "force_push_paths": ("path", "prisms"),
+    "force_push_paths": ("path", "prisms", "learned"),
     "force_push_grid": ("real", "push_mujoco"),
-    "floors_*": ("floor",),
+    "floors_steps": ("floor",),
+    "floors_*": ("floor", "learned"),
     "drives": ("drives", "wide", "hostile", "real"),
     "pose*": ("pose",),
     "drives_omni": ("wide", "hostile", "real"),
@@ -99,28 +105,33 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "drives_learned": ("drives", "learn"),
     "presets": ("drives",),
     "engines_*": ("wide", "mujoco", "mjx", "quasistatic"),
-    "export_*": ("export_c", "export_js", "wide"),
+    "export_worlds": ("export_c", "export_js", "wide"),
+    "export_*": ("export_c", "export_js", "wide", "learned"),
     "attack": ("attack", "tune_es"),
     "rare*": ("rare", "wide"),
-    "regression": ("regress",),
+    "regression": ("regress", "learned"),
     "sensitivity": ("sensitivity", "hostile", "real"),
     "fit_*": ("push_fused", "wide", "tune_es"),
     "real_pushes_*": ("real_pushes",),
-    **dict.fromkeys(("gradients_*", "learned_windows"), ("tune_grad", "learn")),
+    "gradients_*": ("tune_grad", "learn"),
+    "learned_windows": ("tune_grad", "learn", "learned"),
     **dict.fromkeys(("ground", "straight"), ("push_mujoco", "push_fused")),
     "support*": ("wide", "hardware"),
     "mit*": ("real_pushes",),
     "ceiling": ("ladder", "ceiling"),
-    **dict.fromkeys(("ladder", "bearings", "plus", "saturation", "tuned"), ("ladder", *_TRIALS)),
+    **dict.fromkeys(("ladder", "bearings"), ("ladder", *_TRIALS, "learned")),
+    **dict.fromkeys(("plus", "saturation", "tuned"), ("ladder", *_TRIALS)),
     "rivals_tuned": ("ladder", "tune_es"),
     **dict.fromkeys(
-        ("learned_test", "learned_tasks", "learned_failures", "sb3"), ("hostile", "learn")
+        ("learned_test", "learned_tasks", "learned_failures"), ("hostile", "learn", "learned")
     ),
+    "sb3": ("hostile", "learn"),
     **dict.fromkeys(("limits", "sizes"), ("wide", "hostile")),
     **dict.fromkeys(("plans", "replans"), ("quasistatic",)),
     "feet": ("wide", "feet"),
-    **dict.fromkeys(("headline", "models"), (*_TRIALS, "path", "corridor", "mujoco")),
-    **dict.fromkeys(("million", "random_worlds", "robots"), ("wide", "real")),
+    **dict.fromkeys(("headline", "models"), (*_TRIALS, "path", "corridor", "mujoco", "learned")),
+    "million": ("wide", "real", "learned"),
+    **dict.fromkeys(("random_worlds", "robots"), ("wide", "real")),
     "real": ("real",),
     "round_base*": ("round",),
     **dict.fromkeys(

@@ -44,12 +44,6 @@ STALE: dict[str, str] = {
     **dict.fromkeys(
         (
             "attack",
-            "corridors_failures",
-            "corridors_lookaheads",
-            "corridors_objects",
-            "corridors_open",
-            "corridors_paths",
-            "corridors_widths",
             "fit_bags",
             "fit_coverage",
             "fit_methods",
@@ -64,13 +58,10 @@ STALE: dict[str, str] = {
         ("ground", "straight"), "a push ran in the program of a sweep, with other last bits"
     ),
     **dict.fromkeys(
-        ("engines_ideal", "engines_wide", "headline", "models", "tasks_parity"),
+        ("engines_ideal", "engines_wide", "tasks_parity"),
         "objects got supports, with other last bits of C MuJoCo",
     ),
-    **dict.fromkeys(
-        ("bearings", "ceiling", "ladder", "plus", "saturation", "tuned"),
-        "the ladder, whose small run tells of changes, got more laws",
-    ),
+    "plus": "the ladder, whose small run tells of changes, got more laws",
     **dict.fromkeys(
         (
             "reading_checks",
@@ -98,9 +89,6 @@ STALE: dict[str, str] = {
             "drives_learned",
             "gradients_mjx",
             "gradients_tables",
-            "learned_failures",
-            "learned_test",
-            "learned_windows",
             "sb3",
         ),
         "the value function of `rps learn` observes the room to walls",
@@ -115,6 +103,20 @@ STALE: dict[str, str] = {
             "gradients_stiff",
         ),
         "a sum in the solver got its former order back, with other last bits",
+    ),
+    **dict.fromkeys(
+        (
+            "force_push_paths",
+            "grid",
+            "headline",
+            "learned_failures",
+            "learned_test",
+            "learned_windows",
+            "million",
+            "models",
+            "regression",
+        ),
+        "`learned` was trained between walls, too",
     ),
 }
 NUMBERS = SWEEPS / "publish" / "numbers.json"

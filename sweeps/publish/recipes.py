@@ -85,6 +85,7 @@ _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
 _PRESET = "sweep --domain wide --worlds 1000 --seed 9243"
 _PRESETS = ("turtlebot4", "jackal", "husky", "mir100", "pioneer_3dx")
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
+_FORMER = "sweeps/learned/learned_0_4.npz"  # `learned` of 0.4
 _LEARNED = _each(
     "rps sweep --domain {0} --worlds 10000 --seed 5301 "
     "--laws rps_plus sweeps/learned/learned_gru.npz learned --out runs/learned_{0}",
@@ -414,7 +415,7 @@ RECIPES: dict[str, Recipe] = {
     "learned_test": recipe(*_LEARNED, gpu=4, section=rows.beside_first, labels=(*_WIDE, "real")),
     "learned_tasks": recipe(
         *(
-            f"rps sweep {options} --seed 7301 --laws learned sweeps/learned/learned_tasks.npz"
+            f"rps sweep {options} --seed 7301 --laws {_FORMER} learned"
             for options in _BETWEEN_WALLS.values()
         ),
         cores=20,
