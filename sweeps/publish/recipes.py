@@ -483,6 +483,7 @@ RECIPES: dict[str, Recipe] = {
         gpu=8,
         section="*, box",
     ),
+    "moved": recipe(f"rps sweeps/publish/moved.py {_MACHINE}", cores=1),
 }
 
 # Files of old versions, which are not computed again.
