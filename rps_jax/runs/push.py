@@ -245,7 +245,7 @@ def bag_steps(trajectory: Trajectory, obs: PyTree, period: float) -> Iterator[St
     snapshots, touch = trajectory.snapshots, obs.touch
     lines = {k: x for k, x in trajectory.world.task.lines().items() if k in Step._fields}
     extra = {"signal", "f_robot", "p_world_object", "r_object"} & set(obs._fields)
-    yaws = touch.yaw_target
+    yaws = touch.yaw_target if touch.relative is None else None
     for i in range(len(snapshots.time)):
         position, yaw = object_pose(snapshots.qpos[i])
         yield Step(
