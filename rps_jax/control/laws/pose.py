@@ -561,8 +561,8 @@ def memory(state: PoseState) -> Memory:
     """Return the mode and the middle of the box."""
     mode = ("", *MODES[:2])[int(state.mode)]
     ahead, left, behind, right = state.h
-    middle = np.array([ahead - behind, left - right]) / 2
-    middle = state.goal[:2] + solid.rotate(state.goal[2], middle)
+    goal, middle = np.asarray(state.goal), np.array([ahead - behind, left - right]) / 2
+    middle = goal[:2] + solid.rotate(goal[2], middle)
     return Memory(mode, middle) if state.touched else Memory(mode)
 
 
