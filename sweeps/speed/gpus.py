@@ -50,7 +50,7 @@ _TRACED = (
     "noted = []\n"
     "rps_jax.sweep({!r}, 'wide', worlds={}, report_to=lambda x: noted.append(x.segment))\n"
     "rows = [[*x[:3], *(x.live.get(i, 0) for i in range({}))] for x in noted if x is not None]\n"
-    "print(json.dumps(rows))\n"
+    "print(json.dumps(rows, default=int))\n"
 )
 _OBJECTS = [words(name) for name in parse_domain("wide").objects]
 
