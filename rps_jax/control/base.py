@@ -154,8 +154,6 @@ class Law(Generic[Params, State, Obs]):
     check: Callable[[Params], Params] = check_finite_leaves  # raises InputError for bad params
     # Of the parameters that may be tuned, by name; a registered law has those of its declarations.
     bounds: Mapping[str, Bound] | tuple[tuple[str, Bound], ...] = ()
-    # Defaults of an earlier version that differ; a file of changes must name these parameters.
-    earlier: tuple[tuple[str, float], ...] = ()
     # Default widths of the smoothed law, which `init` and `step` accept as the keyword
     # `temperatures`. None: the law has no smooth form.
     temperatures: Smoothing | None = None

@@ -172,7 +172,7 @@ def _program(function: Function, args: Sequence[object]) -> tuple[object, object
     return (re.sub("0x[0-9a-f]+", "", str(traced.jaxpr)), constants), results
 
 
-def _describe(value: Any) -> str:
+def _describe(value: object) -> str:
     """Describe a value in a few words."""
     if isinstance(value, jax.ShapeDtypeStruct):
         return f"{value.dtype} {value.shape}"
@@ -190,7 +190,7 @@ def _difference(state: object, next_state: object) -> str:
     return ""
 
 
-def _unwrap(function: Any) -> Any:
+def _unwrap(function: Callable[..., object]) -> Any:
     """Return the function inside nested `functools.partial` objects and decorators."""
     while isinstance(function, functools.partial):
         function = function.func

@@ -92,25 +92,6 @@ _LEARNED = _each(
     *_WIDE,
     "real",
 )
-_VARIANTS = tuple(
-    f"rps sweeps/learned/variants.py --variants '{name}' --minutes 4.5 --out runs/variant_{i}"
-    for i, name in enumerate(
-        (
-            "warm",
-            "hard domains",
-            "long credit",
-            "4,096 worlds",
-            "scratch",
-            "uniform worlds",
-            "reward of 0.2.0",
-            "with tasks",
-        )
-    )
-)
-_CONTINUED = tuple(
-    f"rps sweeps/learned/variants.py --variants '{name}' --minutes 11 --out runs/continued_{i}"
-    for i, name in enumerate(("continued", "continued, 4,096 worlds", "continued, failures cost 2"))
-)
 _TABLES = "rps tune grad --law sweeps/gradients/tables.py"
 _PLUS_TABLES = ("Plus64", "Plus2048")
 _HOSTILE = (
@@ -296,11 +277,6 @@ RECIPES: dict[str, Recipe] = {
         gpu=4,
         section="Equal outcomes",
     ),
-    "landscape": recipe(
-        "rps sweeps/landscape --worlds 510 --candidates 120",
-        cores=24,
-        section="Success, time and way",
-    ),
     "ground": recipe(
         "rps sweeps/ground",
         cores=30,
@@ -311,13 +287,6 @@ RECIPES: dict[str, Recipe] = {
         f"rps sweeps/ground/support.py --worlds 1000 --repeats 6 {_MACHINE}", cores=1
     ),
     "force_push_grid": recipe("rps sweeps/force_push_grid", cores=4, section="Pushes that succeed"),
-    "mends": recipe(
-        *_each("rps sweeps/mends --domain {} --worlds 4096 --seed 80", *_WIDE[::-1]),
-        gpu=6,
-        section="Against*",
-        labels=_WIDE[::-1],
-        columns=("", "success", "against P1, P2 outside the Realignment State", "p (Holm)"),
-    ),
     "rivals_tuned": recipe(
         *_each(
             "rps tune es --law {0} --domain wide hostile --worlds 16 --population 12 "
@@ -463,18 +432,6 @@ RECIPES: dict[str, Recipe] = {
         section="A planner that knows the world",
         labels=("", "", "hostile", "real"),
     ),
-    "learned_variants": recipe(
-        *_VARIANTS,
-        f"rps sweeps/learned/variants.py {' '.join(map('runs/variant_{}'.format, range(8)))} "
-        f"{_MACHINE}",
-        gpu=50,
-    ),
-    "learned_continued": recipe(
-        *_CONTINUED,
-        f"rps sweeps/learned/variants.py {' '.join(map('runs/continued_{}'.format, range(3)))} "
-        f"--file learned_continued {_MACHINE}",
-        gpu=35,
-    ),
     # --- speed, with nothing else running ---
     "speed": recipe(
         "rps sweeps/speed --names 'C in closed loop' 'fused standard' 'fused fast' quasistatic "
@@ -538,6 +495,7 @@ RECIPES: dict[str, Recipe] = {
         gpu=8,
         section="*, box",
     ),
+    "moved": recipe(f"rps sweeps/publish/moved.py {_MACHINE}", cores=1),
 }
 
 # Files of old versions, which are not computed again.

@@ -370,6 +370,8 @@ LAW = Law(
     memory=memory,
 )
 _TUNED = UnicycleParams()
+# Names of the presets that are tuned for bases with a drive.
+PRESET_OF: dict[str, str] = {"differential": "unicycle", "car": "unicycle_car"}
 PRESETS = {
     "unicycle": _TUNED,
     "unicycle_car": _TUNED._replace(
