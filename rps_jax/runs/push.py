@@ -166,7 +166,7 @@ class Trace(Trajectory):
         shown = _evenly_spaced(len(self.snapshots.time), round(seconds * fps))
         contacts = np.asarray(p_world_contact(self.snapshots))[shown]
         states = [rows(self.law_states, i) for i in shown]
-        memories = (memory_of(self.world, self.params, state) for state in states)
+        memories = (memory_of(self.params, state) for state in states)
         poses = watch(self.snapshots.qpos[shown])
         marks = zip(poses, contacts, memories, strict=True)
         shots = ([video.Shot(qpos, at, *memory)] for qpos, at, memory in marks)

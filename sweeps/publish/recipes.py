@@ -311,6 +311,7 @@ RECIPES: dict[str, Recipe] = {
     **dict.fromkeys(
         ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 10000 {_MACHINE}", gpu=2)
     ),
+    "pose_sight": recipe(f"rps sweeps/pose/sight.py {_MACHINE}", gpu=2),
     "drives": recipe(f"rps sweeps/drives {_MACHINE}", cores=35, gpu=6),
     "drives_omni": recipe(
         "rps sweeps/drives --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "
