@@ -69,10 +69,9 @@ TABS: dict[str, list[Any]] = {
         "notebooks/05_tuning.md",
         "notebooks/10_gradients.md",
         "tuned",
-        "landscape",
         "gradients",
     ],
-    "Laws": ["ladder", "rps_plus", "mends", "learned", "force_push_grid", "failures"],
+    "Laws": ["ladder", "rps_plus", "learned", "force_push_grid", "failures"],
     "Robots": [
         "docs/my_robot.md",
         "docs/on_a_robot.md",

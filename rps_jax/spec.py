@@ -25,43 +25,10 @@ T = TypeVar("T")
 SPEC = "spec"  # key in the metadata of a field of a dataclass
 LIMITS = ("ge", "gt", "le", "lt")  # at least, above, at most, below; names of `annotated_types`
 # Symbols of units; a unit is a product or quotient of their powers, as kg m^2 or m/s^2.
-SYMBOLS = frozenset(
-    [
-        "1",
-        "%",
-        "m",
-        "mm",
-        "km",
-        "in",
-        "rad",
-        "deg",
-        "s",
-        "ms",
-        "us",
-        "ns",
-        "min",
-        "h",
-        "d",
-        "g",
-        "kg",
-        "t",
-        "N",
-        "J",
-        "W",
-        "Hz",
-        "kHz",
-        "GHz",
-        "V",
-        "F",
-        "pF",
-        "bytes",
-        "kB",
-        "MB",
-        "GB",
-        "px",
-        "frame",
-    ]
-)
+_SYMBOLS = """
+1 % m mm km in rad deg s ms us ns min h d g kg t N J W Hz kHz GHz V F pF bytes kB MB GB px frame
+"""
+SYMBOLS = frozenset(re.findall(r"\S+", _SYMBOLS))
 _FACTOR = re.compile(r"([A-Za-z%1]+)(\^-?\d+)?")
 
 
@@ -136,7 +103,7 @@ class Spec:
         """Attributes of a variable of a dataset."""
         return {"units": self.unit or "1"} | ({"long_name": self.about} if self.about else {})
 
-    def check(self, name: str, value: Any) -> float:
+    def check(self, name: str, value: object) -> float:
         """Return a value as a float if it is within the limits, or raise InputError.
 
         It must be finite, unless infinity is a limit.
@@ -151,27 +118,21 @@ class Spec:
 
 
 @dataclass(frozen=True)
-class Choices:
-    """Allowed texts of a field, from a registry that programs extend."""
-
-    names: Callable[[], tuple[str, ...]]
-
-
-@dataclass(frozen=True)
 class Named:
-    """Names that texts of a type may begin with, from a registry; help lists them."""
+    """Names with which texts of a type begin, from a registry that programs extend."""
 
     names: Callable[[], Iterable[str]]
+    closed: bool = False  # whether no other text is allowed
 
 
-def annotation_in(hint: Any, kind: type[T]) -> T | None:
+def annotation_in(hint: object, kind: type[T]) -> T | None:
     """Return the annotation of a kind of a type, of an alternative of it, or of its items."""
     metadata = getattr(hint, "__metadata__", ())
     inner = (annotation_in(x, kind) for x in typing.get_args(hint) if not metadata)
     return next((x for x in (*metadata, *inner) if isinstance(x, kind)), None)
 
 
-def spec_of(annotation: Any) -> Spec | None:
+def spec_of(annotation: object) -> Spec | None:
     """Return the declaration in an annotation, with the limits that stand beside it."""
     metadata = getattr(annotation, "__metadata__", ())
     spec = next((x for x in metadata if isinstance(x, Spec)), None)
@@ -187,7 +148,7 @@ def spec_of(annotation: Any) -> Spec | None:
     return dataclasses.replace(spec, **limits) if limits else spec
 
 
-def _texts_of(kind: type) -> Mapping[str, Any]:
+def _texts_of(kind: type) -> Mapping[str, str]:
     if sys.version_info < (3, 14):
         return inspect.get_annotations(kind)
     import annotationlib  # pyright: ignore[reportMissingImports]
@@ -196,7 +157,7 @@ def _texts_of(kind: type) -> Mapping[str, Any]:
 
 
 @functools.cache
-def _annotations_of(kind: type) -> dict[str, Any]:
+def _annotations_of(kind: type) -> dict[str, object]:
     """Return the annotations of a class.
 
     A class without declarations may have annotations of names that do not exist at run time.

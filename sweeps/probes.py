@@ -124,12 +124,10 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("ladder", "bearings"), ("ladder", *_TRIALS, "learned")),
     **dict.fromkeys(("plus", "saturation", "tuned"), ("ladder", *_TRIALS)),
     "rivals_tuned": ("ladder", "tune_es"),
-    "landscape": ("wide", "hostile", "tune_es"),
     **dict.fromkeys(
         ("learned_test", "learned_tasks", "learned_failures"), ("hostile", "learn", "learned")
     ),
-    **dict.fromkeys(("learned_variants", "learned_continued", "sb3"), ("hostile", "learn")),
-    "mends": ("wide", "hostile", "tune_es"),
+    "sb3": ("hostile", "learn"),
     **dict.fromkeys(("limits", "sizes"), ("wide", "hostile")),
     **dict.fromkeys(("plans", "replans"), ("quasistatic",)),
     "feet": ("wide", "feet"),
@@ -141,7 +139,9 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(
         ("arena", "commands*", "compilers*", "costs", "derivatives*", "environments*", "gpus"), ()
     ),
-    **dict.fromkeys(("kernel", "levers", "robot", "speed*", "stages", "tasks_cost_*"), ()),
+    **dict.fromkeys(
+        ("kernel", "levers", "moved", "robot", "speed*", "stages*", "tasks_cost_*"), ()
+    ),
     "maps": ("corridor",),
 }
 

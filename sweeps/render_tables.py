@@ -50,17 +50,11 @@ STALE: dict[str, str] = {
             "fit_methods_quantities",
             "fit_quantities",
             "fit_worth",
-            "landscape",
-            "learned_continued",
-            "learned_variants",
-            "mends",
             "rivals_tuned",
         ),
         "tuners got worlds of their own, which no sweep meets",
     ),
-    **dict.fromkeys(
-        ("ground", "straight"), "a push ran in the program of a sweep, with other last bits"
-    ),
+    **dict.fromkeys(("ground",), "a push ran in the program of a sweep, with other last bits"),
     **dict.fromkeys(
         ("engines_ideal", "engines_wide", "tasks_parity"),
         "objects got supports, with other last bits of C MuJoCo",
@@ -105,14 +99,12 @@ STALE: dict[str, str] = {
     **dict.fromkeys(
         (
             "force_push_paths",
-            "grid",
             "headline",
             "learned_failures",
             "learned_test",
             "learned_windows",
             "million",
             "models",
-            "regression",
         ),
         "`learned` was trained between walls, too",
     ),

@@ -157,8 +157,6 @@ COMMANDS = {
         "--laws npss": "unknown law 'npss': .*did you mean 'nps'",
         "--laws rps,L.json": "L = -1.0 is not allowed",
         "--laws rps,L_word.json": "rps L = x is not allowed: it must be a number",
-        "--laws rps,old.json": "the file omits saturate_first, whose default was 0 in version 0.3",
-        "--laws nps,old.json": "append ,saturate_first=0 or ,saturate_first=1",
         "--laws rps,list.json": "list.json is no JSON object .it holds no names with values",
         "--laws rps,.": "law = rps,. is not allowed: write changes as name=value or file.json",
         "--laws rps,good.json rps,good.json": "laws = .* is not allowed: name each once",

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import PAPER, results_of
+from helpers import PAPER, refusing, results_of
 from numpy.random import default_rng
 
 from rps_jax.runs import execution
@@ -16,7 +16,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import parse_domain
 from rps_jax.world.tasks.corridor import BASE, OBJECT
-from sweeps.corridors import costs, parity, study
+from sweeps.corridors import costs, maps, parity, study
 from sweeps.corridors.widths import fit
 from sweeps.study_base import run_together
 
@@ -133,3 +133,23 @@ def test_costs_are_relative_to_reach():
     (table,) = costs.Costs(tasks=("reach", "path")).report_tables(results)
     assert table.rows[1][1:3] == ["10.0 µs", "1.000"]
     assert table.rows[2][2:] == ["2.000", "1.00 to 3.00"]
+
+
+def test_a_push_in_a_map_is_found_and_a_broken_map_is_one_sentence(tmp_path):
+    image = np.full((40, 100), 205, np.uint8)
+    image[5:35, 5:95] = 254
+    (tmp_path / "hall.pgm").write_bytes(b"P5 100 40 255\n" + image.tobytes())
+    path = tmp_path / "hall.yaml"
+    path.write_text("image: hall.pgm\nresolution: 0.1\norigin: [-1, 0, 0]\n")
+    scale, start, goal, cells = maps.push_of(path)
+    assert (scale, cells) == (1, 4000)
+    assert start[1] == pytest.approx(2, abs=0.6)
+    assert 4 < goal[0] - start[0] < 10
+    for text, message in (
+        ("image: [", "is no YAML mapping"),
+        ("image: none.pgm", "image"),
+        ("image: hall.pgm", "resolution = None"),
+    ):
+        path.write_text(text)
+        with refusing(message):
+            maps.push_of(path)

@@ -359,7 +359,7 @@ def test_the_command_line_and_a_run_of_another_kind(tmp_path, capsys, command):
     assert (curve.finite[:2] == 1.0).all()
     assert np.isfinite(curve[["gradient", "gradient_error"]][:2]).all(axis=None)
     assert curve["params.L"][1] != curve["params.L"][0] or curve.gradient[0] == 0
-    names = {"L", "K_h", "v_lost", "saturate_first"}
+    names = {"L", "K_h", "v_lost"}
     assert set(json.loads((tmp_path / "tuned.json").read_text())) == names
     assert "seed = 0 there, 1 asked" in refusal(
         capsys, f"{command} 2 {RUN} --seed 1 --out", tmp_path

@@ -22,7 +22,6 @@ STUDIES = sorted(path.parent for path in SWEEPS.glob("*/study.py"))
 UNKNOWN = [
     "gradients/race.py --methods newton",
     "gradients/race.py --counts 7",
-    "landscape --domain wyde",
     "engines --domain wyde",
     "random_worlds --domains wyde",
     "random_worlds --laws none",
@@ -38,12 +37,9 @@ UNKNOWN = [
     "planning --methods newton",
 ]
 REFUSED = [
-    ("landscape --laws rps,tund.json", r"tund\.json cannot be read"),
-    ("landscape --laws pursuit", "law = pursuit is not allowed"),
     ("speed --families cone", "cone"),
     ("levers --family cone", "cone"),
     ("limits --limits leg", "did you mean 'lag'"),
-    ("mends --laws none", "unknown mend 'none'"),
     ("ground --grounds our", "did you mean 'ours'"),
     ("force_push_grid --duration 0", "duration"),
     ("publish --only nothing", "no data file has such a name"),

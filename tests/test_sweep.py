@@ -41,8 +41,9 @@ from rps_jax.analysis import statistics
 from rps_jax.app.cli import running
 from rps_jax.geometry import planar
 from rps_jax.record import cache, files
-from rps_jax.runs import execution, sweep
+from rps_jax.runs import sweep
 from rps_jax.runs.plan import Shard, load_plan, open_run
+from rps_jax.runs.results import store_chunk
 from rps_jax.runs.sweep import merge
 from rps_jax.trials import batch, trial
 from rps_jax.trials.trial import Rules
@@ -339,7 +340,7 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
     columns = files.decode_arrays(victim.read_bytes())
     del columns["tipped"]
     victim.unlink()
-    execution.store_chunk(folder, 0, files.encode_arrays(**columns))
+    store_chunk(folder, 0, files.encode_arrays(**columns))
     with refusing(r"part 0 .* another version .it lacks tipped"):
         merge([folder], out=folder)
 

@@ -62,12 +62,12 @@ def test_the_written_file_has_the_whole_law():
     narrow, tuned = Space(("l_cr",)), RPSParams.tuned()
     low = narrow.params(narrow.vector(PAPER._replace(l_cr=0.12)))
     written = narrow.changed_values(narrow.vector(low))
-    assert written == pytest.approx({"l_cr": 0.12, "l_mr": 0.12, "saturate_first": 1.0})
+    assert written == pytest.approx({"l_cr": 0.12, "l_mr": 0.12})
     rps.check(PAPER._replace(**written))
     second = Space(("eta",), tuned)
     again = PAPER._replace(**second.changed_values(second.vector(tuned)))
     assert_allclose(again, tuned, rtol=1e-5)
-    assert set(narrow.changed_values(narrow.vector(PAPER))) == {"l_cr", "saturate_first"}
+    assert set(narrow.changed_values(narrow.vector(PAPER))) == {"l_cr"}
 
 
 def test_a_vector_worked_out_by_hand():
@@ -386,7 +386,6 @@ def test_a_search_ends_with_its_budget_and_resumes_with_more(tmp_path, pretended
 def test_it_finds_the_place_and_writes_it_down(tmp_path, pretended):
     tuned(tmp_path, evolution(20))
     result = json.loads((tmp_path / "tuned.json").read_text())
-    assert result.pop("saturate_first") == 1.0
     assert result == {"L": pytest.approx(0.4, abs=0.03), "K_h": pytest.approx(0.6, abs=0.03)}
 
 
@@ -415,7 +414,7 @@ def test_the_command_line(tmp_path, capsys):
     calls = [*words.split(), tmp_path / "run"]
     assert command(*calls) == 0
     written = json.loads((tmp_path / "run" / "tuned.json").read_text())
-    assert set(written) == {"L", "K_h", "saturate_first"}
+    assert set(written) == {"L", "K_h"}
     assert (tmp_path / "run" / "tuning.png").stat().st_size > 10_000
     text = capsys.readouterr().out
     assert "Validation: objective" in text

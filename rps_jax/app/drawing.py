@@ -242,6 +242,6 @@ def _colour_of(model: mujoco.MjModel, geom: Any) -> tuple[int, int, int]:
     return _rgb(colour)
 
 
-def _rgb(colour: Any) -> tuple[int, int, int]:
+def _rgb(colour: Sequence[float] | np.ndarray) -> tuple[int, int, int]:
     r, g, b = (round(255 * float(c)) for c in colour[:3])
     return r, g, b

@@ -78,7 +78,7 @@ class Gate:
         silent = logging.Logger("rps view", logging.CRITICAL)  # of malformed requests
         return serve(*arguments, **options, logger=silent)
 
-    def refuses(self, headers: Any) -> bool:
+    def refuses(self, headers: Mapping[str, str]) -> bool:
         """Return whether a request has another host, or comes from another page."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not _is_this_machine(hosts[0]):
@@ -87,7 +87,7 @@ class Gate:
         upgrade = any("websocket" in value.lower() for value in headers.get_all("Upgrade"))
         return (upgrade or bool(origins)) and not same
 
-    def accepts(self, raw: Any) -> bool:
+    def accepts(self, raw: bytes) -> bool:
         """Return whether the controls of the page can send a message."""
         from viser._messages import Message
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +21,7 @@ from rps_jax.control.observation import Twist, with_base
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.record import bag as bags
 from rps_jax.record.files import Arrays
@@ -175,7 +175,7 @@ def shadowed(law: Law, params: LawParams, recorded: Arrays, robot: Robot = Robot
         check_taxels(recorded["signal"], robot.shell, "the bag")
         values |= recorded_ends(recorded["signal"], robot)
 
-    def value_of(path: Sequence[Any], shape: jax.ShapeDtypeStruct) -> jax.Array:
+    def value_of(path: Pytree, shape: jax.ShapeDtypeStruct) -> jax.Array:
         """Return the values (N, ...) of a field of the observation."""
         if (name := path[-1].name) not in values:
             raise InputError(

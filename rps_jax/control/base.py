@@ -154,8 +154,6 @@ class Law(Generic[Params, State, Obs]):
     check: Callable[[Params], Params] = check_finite_leaves  # raises InputError for bad params
     # Of the parameters that may be tuned, by name; a registered law has those of its declarations.
     bounds: Mapping[str, Bound] | tuple[tuple[str, Bound], ...] = ()
-    # Defaults of an earlier version that differ; a file of changes must name these parameters.
-    earlier: tuple[tuple[str, float], ...] = ()
     # Default widths of the smoothed law, which `init` and `step` accept as the keyword
     # `temperatures`. None: the law has no smooth form.
     temperatures: Smoothing | None = None
@@ -168,8 +166,7 @@ class Law(Generic[Params, State, Obs]):
     heading: bool = False
     # state -> bool: whether the law declares that it is done, which ends the trial.
     is_done: Callable[[State], jax.Array] | None = None
-    # (state, goal) -> Memory of one trial; the goal (3,) [m, m, rad] has position and heading.
-    memory: Callable[[State, np.ndarray], Memory] | None = None
+    memory: Callable[[State], Memory] | None = None  # state -> Memory of one trial
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None
 

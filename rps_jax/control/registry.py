@@ -32,6 +32,7 @@ from rps_jax.control.base import (
     named_leaves,
     thawing,
 )
+from rps_jax.control.laws import unicycle
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
@@ -117,8 +118,7 @@ def law_of(params: LawParams | type) -> Law:
 
 def default_law(drive: DriveKind, law: str = "rps") -> str:
     """Return the name of a law, or of one for bases with this drive that cannot follow it."""
-    known = laws_for(drive)
-    return law if drive == "omni" else next((x for x in known if x.endswith(f"_{drive}")), known[0])
+    return law if drive == "omni" else unicycle.PRESET_OF[drive]
 
 
 def laws_for(drive: DriveKind) -> list[str]:
@@ -263,17 +263,7 @@ def parse_law(text: str) -> tuple[str, LawParams]:
     words = str(text).split(",")[1:]
     parts = (Path(x).stem if files.suffix_of(x) == ".json" else x for x in words)
     label = ",".join([label, *parts])
-    changed = replace_leaves(params, values)
-    if any(files.suffix_of(word) == ".json" for word in words):
-        for name, earlier in law_of(params).earlier:
-            default = named_leaves(params).get(name, earlier)
-            if name not in values and default != earlier:
-                rule = (
-                    f"the file omits {name}, whose default was {earlier:g} in version 0.3 and is "
-                    f"{default:g} now; append ,{name}={earlier:g} or ,{name}={default:g}"
-                )
-                raise errors.not_allowed("law", text, rule)
-    return label, changed
+    return label, replace_leaves(params, values)
 
 
 def _parse_leaf(field: str, value: object, shape: tuple[int, ...]) -> object:
@@ -397,7 +387,7 @@ def params_to_json(params: LawParams) -> JsonObject:
     return {"law": kind.__name__} | _SOURCES.get(kind, {}) | leaves_to_json(params)
 
 
-def params_from_json(values: Mapping[str, Any], run: Path | None = None) -> LawParams:
+def params_from_json(values: JsonObject, run: Path | None = None) -> LawParams:
     """Return the parameters that `params_to_json` wrote.
 
     A law whose file has changed is loaded from its copy in the folder of the run.

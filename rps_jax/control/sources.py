@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from rps_jax.errors import InputError
 from rps_jax.record import files, folder
@@ -73,7 +72,7 @@ def describe(path: Path) -> JsonObject:
     return record | ({"imports": dict(sorted(imports.items()))} if imports else {})
 
 
-def find(record: Mapping[str, Any], run: Path | None) -> Path:
+def find(record: JsonObject, run: Path | None) -> Path:
     """Return the file of a law as it was when `describe` made the record.
 
     If the file has changed since, it is the copy in the run folder, with a warning.

@@ -65,7 +65,7 @@ def observation_shapes(
         "taxels": TaxelObservation(touch, signal, flag),
         "ends": EndsObservation(touch, signal, flags(taxels), shape(2), flags(2), flag, shape()),
         "force": ForceObservation(touch, shape(2)),
-        "pose": PoseObservation(touch, shape(2), shape()),
+        "pose": PoseObservation(touch, shape(2), shape(), shape(4, 2) if heading else None),
     }
     return observations[senses]
 
@@ -172,7 +172,7 @@ def _program(function: Function, args: Sequence[object]) -> tuple[object, object
     return (re.sub("0x[0-9a-f]+", "", str(traced.jaxpr)), constants), results
 
 
-def _describe(value: Any) -> str:
+def _describe(value: object) -> str:
     """Describe a value in a few words."""
     if isinstance(value, jax.ShapeDtypeStruct):
         return f"{value.dtype} {value.shape}"
@@ -190,7 +190,7 @@ def _difference(state: object, next_state: object) -> str:
     return ""
 
 
-def _unwrap(function: Any) -> Any:
+def _unwrap(function: Callable[..., object]) -> Any:
     """Return the function inside nested `functools.partial` objects and decorators."""
     while isinstance(function, functools.partial):
         function = function.func

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Float
+from rps_jax.geometry.arrays import Entries, Float, Pytree
 from rps_jax.geometry.friction import friction_of_pads, solved
 from rps_jax.geometry.vectors import Vec, trace_one_world
 
@@ -109,7 +109,7 @@ def push(
     The leaves of `slider` may have a leading axis B. The finger goes straight between points of a
     path, at any speed.
     """
-    own: Any = tuple(
+    own: Entries = tuple(
         x if jnp.ndim(x) > rank else None for x, rank in zip(slider, (2, 2, 0, 0), strict=True)
     )
 
@@ -269,16 +269,16 @@ def _slide(pads: tuple, force: jax.Array, flow: jax.Array, stuck: jax.Array) -> 
     It minimises half of the squared power less the force times the velocity. Guesses are the last
     one, and the twist (3,) of a contact that sticks.
     """
-    constant: Any = jax.lax.stop_gradient((pads, (force[0], force[1], 0.0), flow, stuck))
+    constant: Pytree = jax.lax.stop_gradient((pads, (force[0], force[1], 0.0), flow, stuck))
     fixed, pull, flow, stuck = constant
 
     def cost(v: Vec) -> jax.Array:
         return _power(fixed, v) ** 2 / 2 - pull[0] * v[0] - pull[1] * v[1]
 
     def refine(carry: tuple) -> tuple:
-        v: Any = tuple(carry[0])
+        v: Entries = tuple(carry[0])
         gradient, hessian = friction_of_pads(fixed, v, _SMOOTH)
-        excess: Any = tuple(g - f for g, f in zip(gradient, pull, strict=True))
+        excess: Entries = tuple(g - f for g, f in zip(gradient, pull, strict=True))
         change = solved(excess, hessian)
         tried = [tuple(a - s * b for a, b in zip(v, change, strict=True)) for s in _LENGTHS]
         costs = jnp.stack([cost(x) for x in tried])

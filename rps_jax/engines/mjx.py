@@ -31,6 +31,7 @@ from rps_jax.engines.mjx_colliders import (
 )
 from rps_jax.engines.mujoco import compile_rows
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Entries, Pytree
 from rps_jax.record.files import Arrays
 from rps_jax.robot.base import Tyres, push
 from rps_jax.robot.robot import Robot
@@ -87,7 +88,7 @@ class MJXStage(NamedTuple):
     def _with_walls(self, fields: dict[str, jax.Array], qpos: jax.Array) -> dict[str, jax.Array]:
         """Return fields whose walls are those nearest to the object."""
         model, free = apply(self.model, fields), tuple(qpos[JOINTS.object])
-        corners: Any = tuple(corners_of(model, fields.get(OUTLINE)).T)
+        corners: Entries = tuple(corners_of(model, fields.get(OUTLINE)).T)
         near = nearest_walls(tuple(fields[WALLS].T), free[:3], free[3:], corners)
         position, size, turn = model.geom_pos, model.geom_size, model.geom_quat
         for geom, wall in zip(geoms(model, 0, types.GeomType.BOX), near, strict=True):
@@ -116,7 +117,7 @@ class MJXStage(NamedTuple):
                 (jnp.cos(qpos[JOINTS.base_yaw]), jnp.sin(qpos[JOINTS.base_yaw])),
                 qvel[JOINTS.base],
             )
-            servo: Any = tuple(integral)
+            servo: Entries = tuple(integral)
             force, servo = push(robot, servo, twist, tuple(base), turn, timestep)
             applied = jnp.stack(force)
             if robot.drive != "omni":
@@ -148,7 +149,7 @@ def step(
     data = smooth.crb(model, data)
     if inertia is not None:
         mass = data._impl.M.at[JOINTS.base, JOINTS.base].add(inertia)  # dense
-        held: Any = data.tree_replace({"_impl.M": mass})
+        held: Pytree = data.tree_replace({"_impl.M": mass})
         data = held
     data = smooth.factor_m(model, data)
     data = collision(model, data, *extra)

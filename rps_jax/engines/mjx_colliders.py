@@ -26,6 +26,7 @@ import numpy as np
 
 from rps_jax.engines.fused.contacts import Corners, side_contacts
 from rps_jax.geometry import vectors
+from rps_jax.geometry.arrays import Entries, Pytree
 from rps_jax.world import opengl as opengl  # imports MuJoCo
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
@@ -119,8 +120,8 @@ def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array)
         else jnp.maximum(middle[2] + jnp.array([-1.0, 1.0]) * half[2], 0.0),
     )
     state: Any = SimpleNamespace(base=middle, p=data.xpos[body])
-    m: Any = [tuple(row) for row in data.xmat[body]]
-    contacts: Any = side_contacts(solid, state, m, (turn[0], turn[1]))
+    m: Entries = [tuple(row) for row in data.xmat[body]]
+    contacts: Pytree = side_contacts(solid, state, m, (turn[0], turn[1]))
     z, normal, point, distance = contacts
     back = jnp.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
     n = jnp.stack(normal) @ back

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import numpy as np
 
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Float, Int, Pair, Scalar, Vector, namespace_of
+from rps_jax.geometry.arrays import Array, Entries, Float, Int, Pair, Scalar, Vector, namespace_of
 from rps_jax.geometry.footprint import Footprint
 
 
@@ -22,7 +22,7 @@ class Polyline(NamedTuple):
     arcs: Float[Array, "*B K"]  # [m]
 
     @classmethod
-    def through(cls, vertices: Any) -> Polyline:
+    def through(cls, vertices: Entries) -> Polyline:
         """Return polylines through vertices (..., K, 2) [m], as arrays of the same library."""
         xp = namespace_of(vertices)
         lengths = xp.linalg.norm(xp.diff(vertices, axis=-2), axis=-1)
@@ -177,7 +177,7 @@ def _square(way: Pair, along: _Vectors) -> Array:
 # --- segments between complex numbers, in NumPy --------------------------------------------------
 
 
-def distances(p: Any, q: Any, a: Any, b: Any) -> np.ndarray:
+def distances(p: Entries, q: Entries, a: Entries, b: Entries) -> np.ndarray:
     """Return the distances [m] between segments from p to q, or points, and those from a to b."""
     pairs = (p, a, b), (q, a, b), (a, p, q), (b, p, q)
     sides, lengths = ([f(*pair) for pair in pairs] for f in (_side, to_segment))
@@ -191,13 +191,13 @@ def is_inside(point: complex, a: np.ndarray, b: np.ndarray) -> bool:
     return bool(np.sum(passed & ((_side(point, a, b) > 0) == (b.imag > a.imag))) % 2)
 
 
-def to_segment(point: Any, a: Any, b: Any) -> np.ndarray:
+def to_segment(point: Entries, a: Entries, b: Entries) -> np.ndarray:
     """Return the distances [m] of points from segments from a to b."""
     along, away = b - a, point - a
     share = np.real(np.conj(along) * away) / np.maximum(abs(along) ** 2, 1e-30)
     return abs(away - np.clip(share, 0, 1) * along)
 
 
-def _side(point: Any, a: Any, b: Any) -> np.ndarray:
+def _side(point: Entries, a: Entries, b: Entries) -> np.ndarray:
     """Return a number above 0 for points on the left of lines from a to b."""
     return np.imag(np.conj(b - a) * (point - a))

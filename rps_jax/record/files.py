@@ -16,7 +16,7 @@ import os
 import stat
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -183,7 +183,7 @@ def parse_json(content: bytes | str) -> JsonObject:
         raise ValueError("it is nested too deeply") from error
 
 
-def _unique(pairs: Sequence[tuple[str, Any]]) -> JsonObject:
+def _unique(pairs: Sequence[tuple[str, object]]) -> JsonObject:
     """Return names with values; ValueError if a name is repeated."""
     fields: JsonObject = {}
     for name, value in pairs:
@@ -297,7 +297,7 @@ def check_columns(
     results: xr.Dataset,
     source: object,
     dims: Mapping[str, Sequence[str]],
-    sizes: Mapping[Any, int],  # xarray's keys: any hashable
+    sizes: Mapping[Hashable, int],
 ) -> xr.Dataset:
     """Return the results of a source if they have numeric variables of these dimensions.
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from rps_jax.record import options
 from rps_jax.record.files import JsonObject
+from rps_jax.record.options import Hint
 from rps_jax.spec import annotation_in
 
 
@@ -21,13 +22,13 @@ from rps_jax.spec import annotation_in
 class Stored:
     """Annotation of a type: how manifests and results store values of it."""
 
-    write: Callable[[str, Any], Mapping[str, object]]
+    write: Callable[[str, Hint], Mapping[str, object]]
     """Returns the entries, as JSON, of a field with this name and value."""
     read: Callable[[str, JsonObject, Path], Any] | None = None
     """Returns the value of a field with this name, from all entries and the run folder."""
     kinds: tuple[type, ...] = (object,)
     """Types of the values that `write` accepts; others are written without it."""
-    label: Callable[[Any], str] | None = None
+    label: Callable[[object], str] | None = None
     """Returns a value as the text of an attribute of results."""
 
 
@@ -65,7 +66,7 @@ def fields_from_json(kind: type, entries: JsonObject, folder: Path) -> JsonObjec
     return values
 
 
-def labels(record: Any) -> dict[str, str]:
+def labels(record: object) -> dict[str, str]:
     """Return the fields of a dataclass that are attributes of results."""
     texts = {}
     for name, stored in stored_types(type(record)).items():

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args, get_origin
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
-from rps_jax.spec import SPEC, Choices, Spec, specs_of
+from rps_jax.spec import SPEC, Named, Spec, annotation_in, specs_of
 
 HIDDEN, POSITIONAL, FLAG = "hidden", "positional", "flag"  # metadata of fields
 Hint: TypeAlias = Any  # an annotation: a type, or a form of `typing`
@@ -58,21 +59,16 @@ def option(
 
 def field_types(kind: Hint) -> dict[str, Hint]:
     """Return the types of a dataclass's fields, or of a function's arguments, by name."""
-    types_, choices = _types_of(kind)
-    return types_ | {name: Literal[open_.names()] for name, open_ in choices.items()}
+    types_, closed = _types_of(kind)
+    return types_ | {name: Literal[tuple(named.names())] for name, named in closed.items()}
 
 
 @functools.cache
-def _types_of(kind: Hint) -> tuple[dict[str, Hint], dict[str, Choices]]:
-    """Return types by name, and the choices of those that a registry extends."""
-    hints = typing.get_type_hints(kind, include_extras=True)
-    choices = {
-        name: x
-        for name, hint in hints.items()
-        for x in getattr(hint, "__metadata__", ())
-        if isinstance(x, Choices)
-    }
-    return typing.get_type_hints(kind), choices
+def _types_of(kind: Hint) -> tuple[dict[str, Hint], dict[str, Named]]:
+    """Return types by name, and the texts of those of which a registry has all."""
+    hints = typing.get_type_hints(kind, include_extras=True).items()
+    named = {name: annotation_in(hint, Named) for name, hint in hints}
+    return typing.get_type_hints(kind), {k: x for k, x in named.items() if x and x.closed}
 
 
 def check_fields(record: object, prefix: str = "") -> None:
@@ -95,7 +91,7 @@ def check_arguments(function: Callable[..., object], values: Mapping[str, object
         _check(name, value, field_types(function)[name], None)
 
 
-def _check(name: str, value: Any, kind: Hint, spec: Spec | None) -> None:
+def _check(name: str, value: object, kind: Hint, spec: Spec | None) -> None:
     """Check a value by its type, and by the limits of its declaration."""
     kinds = _alternatives(kind)
     if value is None and type(None) in kinds:
@@ -161,7 +157,7 @@ def _is_of(value: Any, kind: Hint) -> bool:
     return isinstance(value, bare)
 
 
-def _has_items(value: Any) -> bool:
+def _has_items(value: ArrayLike) -> bool:
     return isinstance(value, Sequence) or (hasattr(value, "__iter__") and np.ndim(value) > 0)
 
 

@@ -23,11 +23,12 @@ from __future__ import annotations
 import math
 from functools import reduce
 from types import ModuleType
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from rps_jax import spec
 from rps_jax.geometry import planar
@@ -83,7 +84,7 @@ def observe_pose(
     return poses, delayed + sigma * normal(noise, (3,), pose.dtype)
 
 
-def normal(key: jax.Array, shape: tuple[int, ...], dtype: Any) -> jax.Array:
+def normal(key: jax.Array, shape: tuple[int, ...], dtype: DTypeLike) -> jax.Array:
     """Return normal numbers that are equal in single and double precision."""
     return jax.random.normal(key, shape, jnp.float32).astype(dtype)
 

@@ -20,6 +20,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.shell import BOARDS, HALF_LENGTH, HALF_WIDTH, Boards, Shell
 from rps_jax.spec import Named, Spec
@@ -396,7 +397,7 @@ def parse_robot(robot: RobotLike) -> Robot:
     if isinstance(robot, Mapping):
         for name in robot:
             errors.check_name("robot quantity", name, _FIELDS)
-        values: dict[str, Any] = {
+        values: JsonObject = {
             k: tuple(v) if isinstance(v, list | tuple) else v for k, v in robot.items()
         }
         if "boards" in values:

@@ -31,6 +31,7 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.files import JsonObject
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan, Shard, chunks_by_key
+from rps_jax.runs.results import store_chunk
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.trials.worlds import BatchOptions
 
@@ -152,7 +153,7 @@ def run_on_cluster(
                 (ended,), waiting[:] = ray.wait(waiting)
                 contents, progress, worker = ray.get(ended)
                 for chunk, content in contents.items():
-                    execution.store_chunk(folder, chunk, content)
+                    store_chunk(folder, chunk, content)
                 known[worker["host"], worker["pid"]] = worker
                 all_workers = _join_environments(list(known.values()))
                 provenance.write_environment(folder, environment | all_workers)

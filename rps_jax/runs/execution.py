@@ -20,13 +20,11 @@ from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.plan import Plan, Shard, open_run, shard_chunks
-from rps_jax.runs.results import PlanRequest, Results, name_of
+from rps_jax.runs.results import PlanRequest, Results, StoreChunk, name_of, store_chunk
 from rps_jax.trials.batch import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
-from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import BatchOptions, BatchSize
 
-StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk and its content
 # Runs the missing chunks of a shard in a folder, and may return their results.
 RunMissing = Callable[..., Results | None]
 
@@ -38,14 +36,8 @@ def run_chunks(
     **options: Unpack[BatchOptions],
 ) -> Results:
     """Run chunks of a plan and return their results; each is stored when it is complete."""
-    results = Results(plan)
-
-    def collect(indices: np.ndarray, outcomes: Outcome) -> None:
-        for chunk in results.put(indices, outcomes):
-            if store is not None:
-                store(chunk, results.encode(chunk))
-
-    run_batch([PlanRequest(plan, chunks, results)], plan.setting, collect, **options)
+    results = Results(plan, store)
+    run_batch([PlanRequest(plan, chunks, results)], plan.setting, results.put, **options)
     return results
 
 
@@ -141,8 +133,3 @@ def missing_chunks(folder: Path, plan: Plan, shard: Shard) -> tuple[list[int], i
     stored, chunks = Checkpoints(folder).paths(), shard_chunks(plan, shard)
     missing = [chunk for chunk in chunks if name_of(chunk) not in stored]
     return missing, sum(x.size for x in chunks.values()) - sum(chunks[i].size for i in missing)
-
-
-def store_chunk(folder: Path, chunk: int, content: bytes) -> Path:
-    """Write the file of a chunk into a run folder, atomically."""
-    return Checkpoints(folder).put(name_of(chunk), content, ".npz", new=True)

@@ -123,9 +123,9 @@ class Command(Generic[T]):
 
     out: Path | str | None = None
     """Run folder, in the shell by default runs/NAME; a run that was killed is continued there."""
-    progress: bool | None = option(None, kw_only=True, hidden=True)
+    progress: bool | None = option(None, hidden=True)
     """Whether a bar shows the progress; by default in a terminal and in a notebook."""
-    report_to: ProgressCallback | None = option(None, kw_only=True, hidden=True)
+    report_to: ProgressCallback | None = option(None, hidden=True)
     """Callback that receives the progress instead of a bar."""
 
     QUICK: ClassVar[Mapping[str, object]] = {}  # values of `quick`, by the field's name
@@ -229,21 +229,13 @@ class Command(Generic[T]):
         return next((value for value in vars(self).values() if isinstance(value, Setting)), None)
 
 
-def quick_command(command: C) -> C:
-    """Return a command with its quick values for options at their defaults."""
-    quick, default = command, type(command)()
+def quick_command(command: C, changed: C) -> C:
+    """Return a changed command with the quick values of another for options at their defaults."""
+    default = type(command)()
     for name, value in command.quick_values().items():
-        if attrgetter(name)(command) == attrgetter(name)(default):
-            quick = _replace_field(quick, name, value)
-    return quick
-
-
-def quick_defaults(command: C) -> C:
-    """Return the defaults of a command, with its quick values."""
-    defaults = type(command)()
-    for name, value in command.quick_values().items():
-        defaults = _replace_field(defaults, name, value)
-    return defaults
+        if attrgetter(name)(changed) == attrgetter(name)(default):
+            changed = _replace_field(changed, name, value)
+    return changed
 
 
 def _replace_field(record: D, name: str, value: object) -> D:
@@ -358,7 +350,7 @@ class Question(Command[T]):
 class BagQuestion(Question[T]):
     """Base class of questions that read bags."""
 
-    topics: TopicsLike = option((), kw_only=True, flag="topic")
+    topics: TopicsLike = option((), flag="topic")
     """Topic of a bag that has another name, as odom=/ridgeback/odom; the option may be repeated.
     The keys are odom, target, path, contact, taxels, force, object, cmd_vel, tf and tf_static. In
     Python a dict: topics={"odom": "/ridgeback/odom"}."""
@@ -374,7 +366,7 @@ class QuickQuestion(Question[T]):
     IGNORED_FIELDS = ("quick",)
 
     def with_quick_values(self) -> Self:
-        return quick_command(self) if self.quick else self
+        return quick_command(self, self) if self.quick else self
 
     def quick_note(self) -> str:
         return quick_note(self) if self.quick else ""
@@ -384,9 +376,9 @@ class QuickQuestion(Question[T]):
 class TrialQuestion(QuickQuestion[T]):
     """Base class of questions that run trials."""
 
-    slots: int | None = option(None, 1, 10_000_000, kw_only=True)
+    slots: int | None = option(None, 1, 10_000_000)
     """Number of worlds that one worker steps at once; by default as suits engine and device."""
-    workers: int | None = option(None, 1, 1024, kw_only=True)
+    workers: int | None = option(None, 1, 1024)
     """Number of host threads that step worlds; by default as suits engine and device."""
 
     IGNORED_FIELDS = ("slots", "workers")

@@ -36,12 +36,18 @@ from rps_jax.world import draws, points
 _FLAGS = ("success", "tipped", "diverged", "nan_twist", "stalled", "unfelt")
 _TYPES: dict[str, type] = dict.fromkeys(_FLAGS, np.int8)
 _LATER = {"repositions", "contact_lost_path"}  # outcomes that version 0.4.0 does not store
+StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk and its content
 _PREFETCH = 16384  # worlds of one program that are built before they are needed, about
 
 
 def name_of(chunk: int) -> str:
     """Return the name of a chunk's checkpoint in the run folder."""
     return f"{chunk:07d}"
+
+
+def store_chunk(folder: Path, chunk: int, content: bytes) -> Path:
+    """Write the file of a chunk into a run folder, atomically."""
+    return Checkpoints(folder).put(name_of(chunk), content, ".npz", new=True)
 
 
 @dataclass(frozen=True)
@@ -87,9 +93,10 @@ class Results:
     The memory of a column is claimed when it is filled.
     """
 
-    def __init__(self, plan: Plan):
-        """Prepare the columns of all trials."""
-        self.plan, self.shape = plan, (len(plan.laws), plan.worlds)
+    def __init__(self, plan: Plan, store: StoreChunk | None = None):
+        """Prepare the columns of all trials; `store` is called with each chunk that is complete."""
+        self.plan, self._store = plan, store
+        self.shape = (len(plan.laws), plan.worlds)
         self._outcomes: Arrays = {}  # (law, world, ...)
         for name in (*specs_of(Outcome), *plan.domain.task.OUTCOMES):
             axes = (3,) if name.endswith("_pose") else ()
@@ -110,20 +117,20 @@ class Results:
         for name, values in columns.items():
             self._drawn.setdefault(name, np.zeros(self.plan.worlds, np.float32))[worlds] = values
 
-    def put(self, indices: np.ndarray, outcomes: Outcome) -> list[int]:
-        """Insert the outcomes of trials; return the chunks that are complete with them."""
+    def put(self, indices: np.ndarray, outcomes: Outcome) -> None:
+        """Insert the outcomes of trials, and store the chunks that are complete with them."""
         at = np.unravel_index(indices, self.shape)
         for name, leaf in outcomes.columns().items():
             self._outcomes[name][at] = leaf
         chunks, counts = np.unique(self._chunk_of[indices], return_counts=True)
         for chunk, count in zip(chunks.tolist(), counts.tolist(), strict=True):
             self.missing[chunk] -= count
-        complete = [chunk for chunk in chunks.tolist() if not self.missing[chunk]]
-        for chunk in complete:
-            del self.missing[chunk]
-        return complete
+            if not self.missing[chunk]:
+                del self.missing[chunk]
+                if self._store is not None:
+                    self._store(chunk, self._encode(chunk))
 
-    def encode(self, chunk: int) -> bytes:
+    def _encode(self, chunk: int) -> bytes:
         """Return the content of a chunk's file."""
         trials = self.plan.chunks[chunk]
         law, worlds = at = np.unravel_index(trials, self.shape)

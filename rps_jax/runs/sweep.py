@@ -6,7 +6,7 @@ The design is paired: every law meets the same worlds. `execution` runs the plan
 import functools
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
@@ -38,7 +38,6 @@ from rps_jax.runs.results import Results, check_table, write_table
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world import points
 from rps_jax.world.domain import task_in_words
-from rps_jax.world.points import Points
 
 
 class PlanQuestion(Question[xr.Dataset]):
@@ -72,31 +71,6 @@ class PlanQuestion(Question[xr.Dataset]):
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         """Return the outcomes of all trials with the attributes of the results."""
         return outcomes.assign_attrs(self.attributes())
-
-
-@dataclass(frozen=True)
-class SweepQuestion(PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQuestion[xr.Dataset]):
-    """Base class of questions about several laws in the same random worlds."""
-
-    worlds: int | None = option(None, 1, 1_000_000_000)
-    """Number of worlds, of indices 0, 1, ...; by default 1000, or the whole grid of a domain with
-    listed targets."""
-    part: int | None = option(None, 1, 1_000_000, kw_only=True)
-    """Checkpoint interval: at most this many trials per law and object are repeated after a kill.
-    By default 1024, and with many worlds a 16th of them, up to 16384."""
-
-    @functools.cached_property
-    def plan(self) -> Plan:
-        """Trials to run."""
-        default = self.ranges.combinations if self.ranges.targets else 1000
-        count = default if self.worlds is None else self.worlds
-        return self.plan_of(count)
-
-    def plan_of(self, count: int, at: Points | None = None) -> Plan:
-        """Return the plan of a number of worlds, which are drawn or lie at points."""
-        # A file takes longer to write than many of its trials take to run.
-        chunk_size = self.part or min(max(count // 16, 1024), 16384)
-        return Plan(self.ranges, count, self.chosen, self.setting, chunk_size, at)
 
 
 def describe_plan(plan: Plan) -> str:
@@ -146,30 +120,33 @@ def success_section(results: xr.Dataset, max_lost: float) -> Section:
     return Section("Success", text, tables.success_table(results, max_lost))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SweepOptions:
     """Options of a sweep besides its laws and worlds."""
 
-    points: str | Path | xr.Dataset | np.ndarray | None = field(default=None, kw_only=True)
+    part: int | None = option(None, 1, 1_000_000)
+    """Checkpoint interval: at most this many trials per law and object are repeated after a kill.
+    By default 1024, and with many worlds a 16th of them, up to 16384."""
+    points: str | Path | xr.Dataset | np.ndarray | None = None
     """Points of the domain's unit cube at which the worlds lie, instead of drawn ones: what
     world.points.worlds_at returned, or a NetCDF file of it, as points.nc of a run folder."""
-    models: bool = field(default=False, kw_only=True)
+    models: bool = False
     """Whether to run the same worlds also on other grounds, cones and steps and in the quasi-static
     model, and to report how much the rates depend on these."""
-    shard: str = field(default="1/1", kw_only=True)
+    shard: str = "1/1"
     """Shard K/N of the run: the N shards are run separately, and joined by `rps merge`."""
-    ray: str | None = field(default=None, kw_only=True)
+    ray: str | None = None
     """Run on the workers of a Ray cluster: auto, its HOST:PORT, or local (all of this host). Each
     worker claims a GPU, or else as many processors as workers, one by default."""
-    ray_device: Device = field(default="auto", kw_only=True)
+    ray_device: Device = "auto"
     """Device of the cluster's workers."""
-    table: Path | str | None = field(default=None, kw_only=True)
+    table: Path | str | None = None
     """File for a table with one row for each law and world: NAME.csv, or NAME.parquet (needs
     pyarrow). NAME.columns.csv beside it has the units and meanings of the columns."""
 
 
 @dataclass(frozen=True)
-class Sweep(SweepOptions, SweepQuestion):
+class Sweep(SweepOptions, PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQuestion[xr.Dataset]):
     """Run every law in the same random worlds; the run can be killed and continued.
 
     Examples:
@@ -185,16 +162,22 @@ class Sweep(SweepOptions, SweepQuestion):
     QUICK: ClassVar = {"worlds": 64}
 
     laws: LawsLike = ("rps", "nps", "aps")
+    worlds: int | None = option(None, 1, 1_000_000_000)
+    """Number of worlds, of indices 0, 1, ...; by default 1000, or the whole grid of a domain with
+    listed targets."""
 
     @functools.cached_property
     def plan(self) -> Plan:
-        if self.points is None:
-            return super().plan
-        source = self.points
-        if isinstance(source, str | Path):
-            source = files.read_dataset(Path(source))
-        at = points.check_points(self.ranges, source)
-        return self.plan_of(len(at.u), at)
+        """Trials to run."""
+        source, at = self.points, None
+        count = self.worlds or (self.ranges.combinations if self.ranges.targets else 1000)
+        if source is not None:
+            source = files.read_dataset(Path(source)) if isinstance(source, str | Path) else source
+            at = points.check_points(self.ranges, source)
+            count = len(at.u)
+        # A file takes longer to write than many of its trials take to run.
+        chunk_size = self.part or min(max(count // 16, 1024), 16384)
+        return Plan(self.ranges, count, self.chosen, self.setting, chunk_size, at)
 
     @property
     def parsed_shard(self) -> Shard:

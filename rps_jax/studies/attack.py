@@ -11,7 +11,7 @@ quantiles of ranges and choices. Noise and corners of prisms are random in every
 import shlex
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from typing import Any, ClassVar, TypeAlias
@@ -101,7 +101,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     """Maximum number of elites to try again in converged C MuJoCo."""
     worst: int = option(48, 1, 100_000)
     """Maximum number of elites to store as a sweep that can be replayed and filmed."""
-    film: bool = field(default=False, kw_only=True)
+    film: bool = option(False, kw_only=True)
     """Whether the command films the worst twelve."""
 
     def check(self) -> None:

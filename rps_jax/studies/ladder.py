@@ -85,9 +85,6 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     worlds: int | None = option(None, 1, 1_000_000_000)
     """Number of worlds of each domain; by default 1000, or the grid of a domain with listed targets
     (paper: 144). With several domains it is at most that grid."""
-    part: int | None = option(None, 1, 1_000_000, kw_only=True)
-    """Checkpoint interval: at most this many trials per law and object are repeated after a kill.
-    By default 1024, and with many worlds a 16th of them, up to 16384."""
 
     @cached_property
     def chosen(self) -> dict[str, LawParams]:

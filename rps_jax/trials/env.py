@@ -32,7 +32,7 @@ from rps_jax.engines import device, native
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Pair
+from rps_jax.geometry.arrays import Pair, Pytree
 from rps_jax.record.options import check_fields, option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
@@ -77,7 +77,7 @@ class State:
     done: jax.Array  # () [1] 0 or 1
     metrics: dict[str, jax.Array]  # () each
     # `world`: the World; `index`: its index in the domain; `observation`: the TaxelObservation.
-    info: dict[str, Any]
+    info: dict[str, Pytree]
 
     def replace(self, **changes: object) -> State:
         """Return the state with other values."""

@@ -120,8 +120,7 @@ def severity(
 
 def severity_of(results: xr.Dataset, rules: Rules) -> np.ndarray:
     """Return the severity (..., world) of the outcomes of a sweep."""
-    missed = statistics.miss_distance(results.min_distance.values, results.distance.values)
-    return severity(results, missed, rules)
+    return severity(results, statistics.distance_left(results), rules)
 
 
 def plan_costs(outcome: Outcome, rules: Rules) -> np.ndarray:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from rps_jax import engines, errors
 from rps_jax.control import registry
@@ -14,7 +14,7 @@ from rps_jax.engines.base import Engine
 from rps_jax.record import options
 from rps_jax.record.files import JsonObject
 from rps_jax.robot.robot import Robot
-from rps_jax.spec import Choices
+from rps_jax.spec import Named
 from rps_jax.trials.trial import Rules
 from rps_jax.world import physics as physics_
 from rps_jax.world.domain import Domain
@@ -60,7 +60,7 @@ class Setting:
       InputError: an engine, physics, rules or seed that are not valid, or not together.
     """
 
-    engine: Annotated[str, Choices(engines.names)] = "fused"
+    engine: Annotated[str, Named(engines.names, closed=True)] = "fused"
     """What steps the worlds: mjx (MuJoCo's equations in JAX), fused (the same equations,
     specialised to these scenes: the fastest, with exact derivatives), mujoco (C MuJoCo, on all
     cores) or quasistatic (planar, without inertia; its derivatives are those of that model)."""
@@ -144,10 +144,10 @@ class Setting:
         return {"physics": physics, "rules": rules} | self.attributes
 
     @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> Setting:
+    def from_json(cls, record: JsonObject) -> Setting:
         """Return the setting of a record with the fields of `to_json`."""
         fields = dict(record["physics"]).items()
-        values: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in fields}
+        values: JsonObject = {k: tuple(x) if isinstance(x, list) else x for k, x in fields}
         physics, rules = Physics(**values), Rules(**record["rules"])
         seed, split = record["seed"], record.get("split")
         return cls(record["engine"], physics, rules=rules, seed=seed, split=split)

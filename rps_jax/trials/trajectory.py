@@ -9,8 +9,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +18,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import LawParams, freeze_functions, named_leaves
 from rps_jax.engines import device, native
 from rps_jax.engines.base import Stage
+from rps_jax.geometry.arrays import Pytree
 from rps_jax.record.options import check_arguments
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
@@ -86,7 +85,7 @@ def rollout(
     smooth: bool = False,
     start: Trial | None = None,
     return_state: bool = False,
-) -> Any:  # `Snapshot`, or (`Snapshot`, `Trial`)
+) -> Pytree:  # `Snapshot`, or (`Snapshot`, `Trial`)
     """Return the trajectory of one world, as a pure function of the world and the law's parameters.
 
     Derivatives are those of the engine, by any number of the world or of the parameters. They are

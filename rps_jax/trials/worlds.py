@@ -21,7 +21,7 @@ from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams, Memory
 from rps_jax.geometry import solid
-from rps_jax.geometry.arrays import Pytree
+from rps_jax.geometry.arrays import Entries, Pytree
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
@@ -35,7 +35,6 @@ from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.points import Points
 from rps_jax.world.scene import JOINTS, Friction, Scene, WorldInputs
-from rps_jax.world.tasks.base import heading_of
 
 Tree = TypeVar("Tree")  # a pytree
 Inputs = tuple[World, LawParams]
@@ -55,7 +54,7 @@ class BatchOptions(BatchSize, total=False):
     callback: ProgressCallback
 
 
-def rows(tree: Tree, index: Any) -> Tree:
+def rows(tree: Tree, index: Entries) -> Tree:
     """Return the rows `index` of every leaf; an index is whatever arrays take."""
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
@@ -92,12 +91,10 @@ class WorldBatch(NamedTuple):
         return first, rest if rest.indices.size else None
 
 
-def memory_of(world: World, params: LawParams, state: Pytree) -> Memory:
-    """Return what the law with a state remembers in a world, for pictures."""
-    target, heading = np.asarray(world.p_world_target, float), heading_of(world.task)
-    yaw = np.arctan2(target[1], target[0]) if heading is None else float(heading)
+def memory_of(params: LawParams, state: Pytree) -> Memory:
+    """Return what the law with a state remembers, for pictures."""
     law = registry.law_of(params)
-    return Memory() if law.memory is None else law.memory(state, np.append(target, yaw))
+    return Memory() if law.memory is None else law.memory(state)
 
 
 class Job(NamedTuple):
@@ -135,7 +132,7 @@ def build(indices: np.ndarray, inputs: WorldInputs, setting: Setting, **fields: 
         rule = "a friction pyramid needs at least 0.01; choose physics=default"
         raise errors.not_allowed("task friction_wall", f"{min(friction):g}", rule)
     stage, staged = engine.stage(inputs)
-    outline: Any = inputs.solids.vertices, inputs.solids.radius
+    outline: Pytree = inputs.solids.vertices, inputs.solids.radius
     robot = None if inputs.robots.ideal else inputs.robots
     world = World(fields=staged, footprint=Footprint(*outline), robot=robot, **fields)
     narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
@@ -167,14 +164,14 @@ def drawn_worlds(
     )
 
 
-def _drawn(drawn: Draw, owner: Owner) -> dict[str, Any]:
+def _drawn(drawn: Draw, owner: Owner) -> dict[str, Entries]:
     """Return the drawn quantities of an owner by name."""
     return {name: drawn.values[name] for name in quantities_of(owner) if name in drawn.values}
 
 
 def _skin(domain: Domain, drawn: Draw) -> Skin:
     sensor = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
-    repeated: Any = jax.tree.map(lambda x: np.full(drawn.indices.size, x, float), sensor)
+    repeated: Pytree = jax.tree.map(lambda x: np.full(drawn.indices.size, x, float), sensor)
     quantities = {} if domain.skin == "ideal" else _drawn(drawn, "skin")
     return repeated._replace(shell=drawn.robot.shell, **quantities)
 

@@ -100,14 +100,12 @@ class Space:
     def changed_values(self, vector: ArrayLike) -> JsonObject:
         """Return the tuned parameters of a vector (p,), and all others that differ from the preset.
 
-        The preset is the first of the law; that of RPS has the paper's parameters. Parameters whose
-        default has changed between versions are included. Arrays are lists.
+        The preset is the first of the law, which is the paper's for RPS. Arrays are lists.
         """
         preset = next(p for p in registry.LAWS.values() if type(p) is type(self.base))
         both = map(registry.named_leaves, (self.params(vector), preset))
         values, defaults = ({k: _rounded(x) for k, x in leaves.items()} for leaves in both)
-        names = (*self.names, *dict(registry.law_of(self.base).earlier))
-        return {n: x for n, x in values.items() if n in names or x != defaults[n]}
+        return {n: x for n, x in values.items() if n in self.names or x != defaults[n]}
 
     def values(self, vector: ArrayLike) -> np.ndarray:
         """Return the rounded parameters (p,) of a vector (p,)."""

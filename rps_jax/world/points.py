@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -158,7 +158,7 @@ def check_points(domain: Domain, u: object) -> Points:
     return Points(values)
 
 
-def cases(domain: Domain, points: Points | None, index: Any) -> np.ndarray:
+def cases(domain: Domain, points: Points | None, index: ArrayLike) -> np.ndarray:
     """Return indices with the object, friction and target of worlds, drawn ones or points."""
     if points is None:
         return np.asarray(index)
@@ -169,7 +169,7 @@ def cases(domain: Domain, points: Points | None, index: Any) -> np.ndarray:
     return np.asarray(np.ravel_multi_index(choices, domain.counts))
 
 
-def draw(domain: Domain, seed: int, points: Points | None, index: Any) -> Draw:
+def draw(domain: Domain, seed: int, points: Points | None, index: ArrayLike) -> Draw:
     """Return the worlds `index` (n,) of one object, drawn ones or points."""
     if points is None:
         return draws.draw(domain, seed, index)
@@ -288,7 +288,7 @@ def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
     return xr.Dataset(data, coords, {"domain": json.dumps(to_json(domain))})
 
 
-def _is_json_of(text: Any, domain: Domain) -> bool:
+def _is_json_of(text: str, domain: Domain) -> bool:
     """Whether a text is this domain's JSON, also of a version without some quantities."""
     try:
         return from_json(json.loads(text)) == domain

@@ -88,7 +88,7 @@ def numbers_of(quantities: Mapping[str, Quantity]) -> tuple[str, ...]:
     return tuple(x for k, q in items for x in ((k,) if q.numbers is None else q.numbers))
 
 
-def check_ranges(record: Any, prefix: str) -> None:
+def check_ranges(record: object, prefix: str) -> None:
     """Raise InputError unless the ranges of a dataclass are within the limits of its quantities."""
     for name, quantity in declared(type(record)).items():
         if (interval := getattr(record, name)) is not None:
@@ -96,7 +96,7 @@ def check_ranges(record: Any, prefix: str) -> None:
 
 
 def check_unused(
-    record: Any, prefix: str, unused: Mapping[str, str], *allowed: Mapping[str, Range]
+    record: object, prefix: str, unused: Mapping[str, str], *allowed: Mapping[str, Range]
 ) -> None:
     """Raise InputError if a dataclass gives a range from which no world draws.
 

@@ -84,14 +84,11 @@ def register_task(task: type[Task]) -> None:
     """
     if not (isinstance(task, type) and issubclass(task, Task) and is_dataclass(task)):
         raise errors.not_allowed("task", repr(task), "give a dataclass that extends Task")
-    if not task.kind or task.kind in _PACKAGE_TASKS:
-        rule = f"choose another one than {', '.join(_PACKAGE_TASKS)}"
+    if not task.kind or task.kind in tasks.PACKAGE_TASKS:
+        rule = f"choose another one than {', '.join(tasks.PACKAGE_TASKS)}"
         raise errors.not_allowed(f"kind of the task {task.__name__}", repr(task.kind), rule)
     tasks.add(task)
     _publish(declared(task))
-
-
-_PACKAGE_TASKS = tuple(tasks.TASKS)
 
 
 def _publish(quantities: Mapping[str, Quantity]) -> None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rps_jax.world.scene import Scene
 
 _VIEW = 2.0  # [m] from the middle to where a base is in view; beyond, the camera follows it
+Colour = Sequence[float]  # red, green, blue and opacity
 _TRAIL_STEP = 0.02  # [m] between the points of a trail
 _TRAIL_POINTS = 1500  # at most, so that memory stays flat: 30 m; the oldest go first
 _TRAIL_WIDTH = 0.007  # [1] of the image's height
@@ -206,7 +207,7 @@ class SceneRenderer:
         return points
 
     def _add_lines(
-        self, segments: Iterable[tuple[np.ndarray, np.ndarray]], rgba: Any, height: float
+        self, segments: Iterable[tuple[np.ndarray, np.ndarray]], rgba: Colour, height: float
     ) -> None:
         """Add lines between pairs of points (2,) [m] at a height [m]."""
         width = _TRAIL_WIDTH * self.renderer.height
@@ -224,7 +225,7 @@ class SceneRenderer:
         c, s = x / length, y / length
         wall.mat = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
-    def _add_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:
+    def _add_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Colour) -> Any:
         """Add a geom to this image, which has at most 10,000."""
         view = self.renderer.scene
         geom = view.geoms[view.ngeom]

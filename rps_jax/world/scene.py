@@ -12,6 +12,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.geometry import solid
+from rps_jax.geometry.arrays import Entries
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
 from rps_jax.record.files import Arrays
@@ -36,8 +37,8 @@ _DECK, _DECK_MARGIN = 0.37, 0.03  # [m] height above which the arm is, and width
 class Friction(NamedTuple):
     """Coulomb coefficients of the two contacts."""
 
-    ground: Any  # [1] object-ground; a number, or (n,) of n worlds
-    robot: Any  # [1] object-robot
+    ground: Entries  # [1] object-ground; a number, or (n,) of n worlds
+    robot: Entries  # [1] object-robot
 
 
 FRICTION = {"S1": Friction(0.3, 0.35), "S2": Friction(0.2, 0.5)}  # Table I
@@ -46,12 +47,12 @@ FRICTION = {"S1": Friction(0.3, 0.35), "S2": Friction(0.2, 0.5)}  # Table I
 class Surroundings(NamedTuple):
     """Surroundings of n worlds other than a level, uniform floor; None where absent."""
 
-    slope: Any = None  # (n, 3) [m/s^2] gravity in the frame of a floor that is not level
+    slope: Entries = None  # (n, 3) [m/s^2] gravity in the frame of a floor that is not level
     # (n, 4) unit normal of a line on the floor, its distance from the origin [m], and the factor
     # [1] of the ground's friction beyond it
-    boundary: Any = None
-    walls: Any = None  # (n, W, 2, 2) [m] both ends of walls that the object may touch
-    friction_wall: Any = None  # (n,) [1] object-wall
+    boundary: Entries = None
+    walls: Entries = None  # (n, W, 2, 2) [m] both ends of walls that the object may touch
+    friction_wall: Entries = None  # (n,) [1] object-wall
 
 
 class WorldInputs(NamedTuple):

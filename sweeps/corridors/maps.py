@@ -20,12 +20,12 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy
 import xarray as xr
-from PIL import Image
-from ruamel import yaml
 
-from rps_jax import InputError, Rules, Setting, evaluate
+from rps_jax import InputError, Rules, Setting, errors, evaluate
 from rps_jax.analysis import statistics
 from rps_jax.questions import Run, call_of, option
+from rps_jax.record.files import read_fields
+from rps_jax.world.tasks.rooms import shades_of
 from rps_jax.worlds import parse_domain
 from sweeps.corridors.costs import cost_of, domain_of
 from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table
@@ -132,12 +132,13 @@ maps = call_of(Maps)
 
 def push_of(path: Path) -> tuple[int, tuple[float, float, float], tuple[float, float], int]:
     """Return scale, start [m, m, rad] and goal [m] of a push in a map, and its number of cells."""
-    fields = yaml.YAML(typ="safe").load(path)
-    shades = np.asarray(Image.open(path.parent / fields["image"]).convert("L"))[::-1] / 255
+    fields, check = read_fields(path), errors.check_finite
+    shades = shades_of(fields)
     occupied = shades if fields.get("negate") else 1 - shades
     # With the threshold of most maps, unknown cells are walls.
-    free = occupied < min(fields.get("free_thresh", 0.196), 0.196)
-    resolution, origin = fields["resolution"], np.array(fields["origin"][:2])
+    free = occupied < min(check("free_thresh", fields.get("free_thresh", 0.196)), 0.196)
+    resolution = check("resolution", fields.get("resolution"), at_least=1e-3, unit="m")
+    origin = errors.check_array("origin", fields.get("origin", (0, 0, 0)), (3,))[:2]
     away = scipy.ndimage.distance_transform_edt(np.pad(free, 1))
     away = resolution * np.asarray(away)[1:-1, 1:-1]
     for scale in _SCALES:

@@ -92,25 +92,6 @@ _LEARNED = _each(
     *_WIDE,
     "real",
 )
-_VARIANTS = tuple(
-    f"rps sweeps/learned/variants.py --variants '{name}' --minutes 4.5 --out runs/variant_{i}"
-    for i, name in enumerate(
-        (
-            "warm",
-            "hard domains",
-            "long credit",
-            "4,096 worlds",
-            "scratch",
-            "uniform worlds",
-            "reward of 0.2.0",
-            "with tasks",
-        )
-    )
-)
-_CONTINUED = tuple(
-    f"rps sweeps/learned/variants.py --variants '{name}' --minutes 11 --out runs/continued_{i}"
-    for i, name in enumerate(("continued", "continued, 4,096 worlds", "continued, failures cost 2"))
-)
 _TABLES = "rps tune grad --law sweeps/gradients/tables.py"
 _PLUS_TABLES = ("Plus64", "Plus2048")
 _HOSTILE = (
@@ -296,11 +277,6 @@ RECIPES: dict[str, Recipe] = {
         gpu=4,
         section="Equal outcomes",
     ),
-    "landscape": recipe(
-        "rps sweeps/landscape --worlds 510 --candidates 120",
-        cores=24,
-        section="Success, time and way",
-    ),
     "ground": recipe(
         "rps sweeps/ground",
         cores=30,
@@ -311,13 +287,6 @@ RECIPES: dict[str, Recipe] = {
         f"rps sweeps/ground/support.py --worlds 1000 --repeats 6 {_MACHINE}", cores=1
     ),
     "force_push_grid": recipe("rps sweeps/force_push_grid", cores=4, section="Pushes that succeed"),
-    "mends": recipe(
-        *_each("rps sweeps/mends --domain {} --worlds 4096 --seed 80", *_WIDE[::-1]),
-        gpu=6,
-        section="Against*",
-        labels=_WIDE[::-1],
-        columns=("", "success", "against P1, P2 outside the Realignment State", "p (Holm)"),
-    ),
     "rivals_tuned": recipe(
         *_each(
             "rps tune es --law {0} --domain wide hostile --worlds 16 --population 12 "
@@ -342,6 +311,7 @@ RECIPES: dict[str, Recipe] = {
     **dict.fromkeys(
         ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 10000 {_MACHINE}", gpu=2)
     ),
+    "pose_sight": recipe(f"rps sweeps/pose/sight.py {_MACHINE}", gpu=2),
     "drives": recipe(f"rps sweeps/drives {_MACHINE}", cores=35, gpu=6),
     "drives_omni": recipe(
         "rps sweeps/drives --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "
@@ -451,18 +421,6 @@ RECIPES: dict[str, Recipe] = {
         section="A planner that knows the world",
         labels=("", "", "hostile", "real"),
     ),
-    "learned_variants": recipe(
-        *_VARIANTS,
-        f"rps sweeps/learned/variants.py {' '.join(map('runs/variant_{}'.format, range(8)))} "
-        f"{_MACHINE}",
-        gpu=50,
-    ),
-    "learned_continued": recipe(
-        *_CONTINUED,
-        f"rps sweeps/learned/variants.py {' '.join(map('runs/continued_{}'.format, range(3)))} "
-        f"--file learned_continued {_MACHINE}",
-        gpu=35,
-    ),
     # --- speed, with nothing else running ---
     "speed": recipe(
         "rps sweeps/speed --names 'C in closed loop' 'fused standard' 'fused fast' quasistatic "
@@ -478,6 +436,11 @@ RECIPES: dict[str, Recipe] = {
     ),
     "commands": recipe(f"rps sweeps/speed/commands.py {_MACHINE}", cores=14),
     "stages": recipe(f"rps sweeps/speed/stages.py {_MACHINE}", cores=1),
+    "stages_gpu": recipe(
+        f"rps sweeps/speed/stages.py --commands '{_SWEPT} --worlds 1000' '{_SWEPT} --worlds 10000' "
+        f"--file stages_gpu {_MACHINE}",
+        gpu=1,
+    ),
     "compilers": recipe(f"rps sweeps/speed/compilers.py {_MACHINE}", cores=5),
     "compilers_gpu": recipe(
         f"rps sweeps/speed/compilers.py --against cpu --worlds 4000 --file compilers_gpu "
@@ -491,7 +454,14 @@ RECIPES: dict[str, Recipe] = {
         + f" --gpus 1 --warm 1000 10000 --file commands_gpu {_MACHINE}",
         gpu=8,
     ),
-    "gpus": recipe(f"rps sweeps/speed/gpus.py --gpus 1 2 {_MACHINE}", gpu=4),
+    "gpus": recipe(  # after version 0.4.0 was checked out into checkouts/0.4.0
+        "rps sweeps/speed/gpus.py --sweeps "
+        + " ".join(f"{x} {x}:checkouts/0.4.0" for x in ("262144:1", "262144:2"))
+        + " 1048576:1"
+        + "".join(f" {x} {x}:checkouts/0.4.0" for x in ("1048576:2", "1000:1", "10000:1"))
+        + f" {_MACHINE}",
+        gpu=5,
+    ),
     # After the installation of the third-party engines: see `speed/arena.py`.
     "arena": recipe(f"rps sweeps/speed/arena.py --peers peers {_MACHINE}", gpu=5),
     "derivatives": recipe(f"rps sweeps/speed/derivatives.py {_MACHINE}", cores=2),
@@ -514,6 +484,7 @@ RECIPES: dict[str, Recipe] = {
         gpu=8,
         section="*, box",
     ),
+    "moved": recipe(f"rps sweeps/publish/moved.py {_MACHINE}", cores=1),
 }
 
 # Files of old versions, which are not computed again.

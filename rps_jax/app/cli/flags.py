@@ -37,7 +37,7 @@ from rps_jax.runs.question import (
     Question,
     SimulationQuestion,
     current_names,
-    quick_defaults,
+    quick_command,
 )
 from rps_jax.spec import Named, Spec, annotation_in, specs_of
 from rps_jax.trials.setting import PhysicsField, Setting
@@ -102,7 +102,7 @@ def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q
     words = [_current_flag(question_type, word) for word in words]
     question, session = _parse(question_type(), command, words)
     if getattr(question, "quick", False):
-        question, session = _parse(quick_defaults(question), command, words)
+        question, session = _parse(quick_command(question, question_type()), command, words)
     options.check_fields(session)
     return question, session
 
@@ -231,7 +231,7 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
 def _text_of(kind: type, name: str, markers: tuple[Any, ...]) -> str:
     """Return the help of a field: its docstring, and the names that its texts may begin with."""
     named = annotation_in(typing.get_type_hints(kind, include_extras=True)[name], Named)
-    names = f" Names: {', '.join(named.names())}." if named else ""
+    names = f" Names: {', '.join(named.names())}." if named and not named.closed else ""
     return (_field_docs(kind, name, markers) or "") + names
 
 

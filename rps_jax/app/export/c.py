@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rps_jax import __version__
-from rps_jax.app.export.program import Program, fill
+from rps_jax.app.export.program import Program
 from rps_jax.lowering.c import HELPERS, literal, statements, struct
 from rps_jax.lowering.routine import Field, Group, Routine
 
@@ -77,6 +76,5 @@ def header(program: Program, prefix: str) -> str:
     }
     axle = program.about_axle(f"#define {upper}_AXLE {{}}")
     stack = max(map(_stack, (lines["STEP"], lines["SKIN"])))
-    about = {"label": program.label, "robot": program.robot, "version": __version__}
-    about["stack"] = f"{math.ceil(stack / 1000)} kB"
-    return fill("law.h.in", **lines, **about, p=p, P=upper, taxels=program.taxels, axle=axle)
+    size = f"{math.ceil(stack / 1000)} kB"
+    return program.fill("law.h.in", p, **lines, stack=size, axle=axle)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rps_jax.app.export import c
-from rps_jax.app.export.program import Program, fill
+from rps_jax.app.export.program import Program
 
 # How the example fills the signals of laws that observe them.
 _TAXELS = """\
@@ -23,9 +23,8 @@ _SIGNALS = {"taxels": _TAXELS, "ends": _ENDS}  # by what the law senses
 
 def files(program: Program, prefix: str) -> dict[str, str]:
     """Return the texts of the files, by name."""
-    names = {"p": prefix, "P": prefix.upper()}
-    signals = _SIGNALS.get(program.senses, "").format(**names)
+    signals = _SIGNALS.get(program.senses, "").format(P=prefix.upper())
     return {
         f"{prefix}.h": c.header(program, prefix),
-        "main.c": fill("main.c.in", **names, signals=signals),
+        "main.c": program.fill("main.c.in", prefix, signals=signals),
     }

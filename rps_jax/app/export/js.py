@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rps_jax import __version__
-from rps_jax.app.export.program import Program, fill
+from rps_jax.app.export.program import Program
 from rps_jax.lowering.js import HELPERS, object_of, statements, text_of
 from rps_jax.lowering.routine import Group
 
@@ -24,12 +23,11 @@ def module(program: Program, prefix: str) -> str:
         "SKIN": statements(program.skin_step, skin, tables),
         **{name.upper(): object_of(name, groups) for name in ("memory", "twist", "contact")},
     }
-    return fill(
+    return program.fill(
         "law.mjs.in",
+        prefix,
         **lines,
         TABLES="\n".join(tables.values()),
-        **{"label": program.label, "robot": program.robot, "version": __version__},
-        **{"p": prefix, "taxels": program.taxels},
         axle=program.about_axle("export const AXLE = {};"),
     )
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rps_jax import __version__
 from rps_jax.control import registry, validation
 from rps_jax.control.observation import Twist, with_base
 from rps_jax.errors import not_allowed
@@ -29,11 +30,6 @@ _AXLE = """
 _REAL = jax.ShapeDtypeStruct((), np.float64)
 
 
-def fill(name: str, **values: object) -> str:
-    """Return the text of a template of this folder with values for its placeholders."""
-    return Template(Path(__file__).with_name(name).read_text("utf-8")).substitute(values)
-
-
 class Program(NamedTuple):
     """A law with its parameters, and the skin of a robot."""
 
@@ -45,6 +41,13 @@ class Program(NamedTuple):
     init: Routine  # params -> memory
     step: Routine  # params, memory, observation -> memory, twist
     skin_step: Routine  # skin_params, skin, scan -> filtered, contact
+
+    def fill(self, name: str, prefix: str, **values: object) -> str:
+        """Return the text of a template of this folder with values for its placeholders."""
+        about = {"label": self.label, "robot": self.robot, "version": __version__}
+        about |= {"p": prefix, "P": prefix.upper(), "taxels": str(self.taxels)}
+        text = Path(__file__).with_name(name).read_text("utf-8")
+        return Template(text).substitute(about, **values)
 
     def about_axle(self, line: str) -> str:
         """Return a line that declares the axle [m], after a comment; nothing without an axle."""

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rps_jax import errors, spec
+from rps_jax import errors
 from rps_jax.control import soft
 from rps_jax.control.base import Law, check_finite_leaves
 from rps_jax.control.laws import rps, unicycle
@@ -26,38 +26,24 @@ from rps_jax.control.laws.unicycle import UnicycleParams, UnicycleState
 from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.geometry.arrays import Number, Parameter
 from rps_jax.robot.robot import DriveKind
-from rps_jax.spec import Spec, document
+from rps_jax.spec import Spec, document, specs_of
 
 KNOTS = 60  # default number of offsets
 
 
-Offsets = Annotated[
-    ArrayLike, Spec("1", "offsets of v_x, v_y, omega, in units of bounds")
-]  # (J, 3)
-Hold = Annotated[Parameter, Spec("1", "control steps per offset: 5 s, so that 60 take 300 s", ge=1)]
-
-
 @document
 class GuidedParams(NamedTuple):
-    """Parameters of RPS, and the planned offsets."""
+    """Parameters of a law, and the planned offsets of its twist."""
 
-    law: RPSParams = RPSParams.tuned()
-    offsets: Offsets = np.zeros((KNOTS, 3))
-    hold: Hold = 250
-
-    @property
-    def d_success(self) -> Number:
-        """Distance at which the target is reached [m]."""
-        return self.law.d_success
-
-
-@document
-class GuidedUnicycleParams(NamedTuple):
-    """Parameters of the law for bases that cannot move sideways, and the planned offsets."""
-
-    law: UnicycleParams = UnicycleParams()
-    offsets: Offsets = np.zeros((KNOTS, 3))
-    hold: Hold = 250
+    law: Annotated[RPSParams | UnicycleParams, Spec(about="parameters of the law")] = (
+        RPSParams.tuned()
+    )
+    offsets: Annotated[ArrayLike, Spec("1", "offsets of v_x, v_y, omega, in units of bounds")] = (
+        np.zeros((KNOTS, 3))
+    )  # (J, 3)
+    hold: Annotated[
+        Parameter, Spec("1", "control steps per offset: 5 s, so that 60 take 300 s", ge=1)
+    ] = 250
 
     @property
     def d_success(self) -> Number:
@@ -65,13 +51,11 @@ class GuidedUnicycleParams(NamedTuple):
         return self.law.d_success
 
 
-Guided = GuidedParams | GuidedUnicycleParams
-
-
-def unplanned(drive: DriveKind) -> Guided:
+def unplanned(drive: DriveKind) -> GuidedParams:
     """Return the parameters without a plan for bases with a drive."""
-    known = unicycle.PRESETS | {"unicycle_differential": UnicycleParams()}
-    return GuidedParams() if drive == "omni" else GuidedUnicycleParams(known[f"unicycle_{drive}"])
+    if drive == "omni":
+        return GuidedParams()
+    return GuidedParams(unicycle.PRESETS[unicycle.PRESET_OF[drive]])
 
 
 class GuidedState(NamedTuple):
@@ -87,10 +71,10 @@ _LAWS: dict[type, Any] = {  # checks, and functions of the laws that are guided
 }
 
 
-def check(params: Guided) -> Guided:
+def check(params: GuidedParams) -> GuidedParams:
     """Return the parameters if they are in range; otherwise raise InputError."""
     _LAWS[type(params.law)][0](params.law)
-    spec.specs_of(GuidedParams)["hold"].check("guided.hold", params.hold)
+    specs_of(GuidedParams)["hold"].check("guided.hold", params.hold)
     shape = np.shape(params.offsets)
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
         raise errors.not_allowed("shape of guided.offsets", shape, "pass (J, 3), J at least 1")
@@ -98,13 +82,13 @@ def check(params: Guided) -> Guided:
     return params
 
 
-def init(params: Guided) -> GuidedState:
+def init(params: GuidedParams) -> GuidedState:
     """Return the state before the first control step."""
     return GuidedState(_LAWS[type(params.law)][1](params.law), jnp.zeros((), jnp.int32))
 
 
 def step(
-    params: Guided, state: GuidedState, obs: Observation
+    params: GuidedParams, state: GuidedState, obs: Observation
 ) -> tuple[GuidedState, Twist, Details]:
     """Compute one control step: the twist of the law with the offset of G1."""
     law_state, twist, details = _LAWS[type(params.law)][2](params.law, state.law, obs)
@@ -125,4 +109,4 @@ def step(
 
 LAW = Law(init, step, check=check, drives=unicycle.LAW.drives)
 # Not listed: `rps ceiling` sets the offsets.
-PRESETS = {"_guided": GuidedParams(), "_guided_unicycle": GuidedUnicycleParams()}
+PRESETS = {"_guided": GuidedParams()}

@@ -384,7 +384,6 @@ LAW = Law(
     check=check,
     bounds=BOUNDS,
     temperatures=Temperatures(),
-    earlier=(("saturate_first", 0.0),),
 )
 PRESETS = {
     "rps": RPSParams.paper(),

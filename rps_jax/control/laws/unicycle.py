@@ -48,7 +48,6 @@ from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from rps_jax import spec
 from rps_jax.control import soft
@@ -350,9 +349,8 @@ def step(
     return memory, Twist(v, axle * omega, omega), details
 
 
-def memory(state: UnicycleState, goal: np.ndarray) -> Memory:
+def memory(state: UnicycleState) -> Memory:
     """Return the mode and the middle M of the object."""
-    del goal
     weights = state.retreat, state.around, state.align
     modes = zip(weights, MODES, strict=True)
     mode = next((words for weight, words in modes if weight > 0.5), "")
@@ -370,6 +368,8 @@ LAW = Law(
     memory=memory,
 )
 _TUNED = UnicycleParams()
+# Names of the presets that are tuned for bases with a drive.
+PRESET_OF: dict[str, str] = {"differential": "unicycle", "car": "unicycle_car"}
 PRESETS = {
     "unicycle": _TUNED,
     "unicycle_car": _TUNED._replace(

@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.geometry.arrays import Array, Bool, Float, Pytree, Scalar, Vector
+from rps_jax.geometry.arrays import Array, Bool, Entries, Float, Pytree, Scalar, Vector
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.record.files import Arrays
+from rps_jax.record.files import Arrays, JsonObject
 from rps_jax.record.options import check_fields
 from rps_jax.robot.shell import Shell
 from rps_jax.spec import Spec
@@ -45,6 +45,7 @@ class Aim(NamedTuple):
     at_end: Bool[Array, ""] | bool = True  # whether the trial may succeed now
     failed: Bool[Array, ""] | bool = False
     yaw_target: Scalar | None = None  # [rad] heading of the goal; None: it has none
+    relative: Scalar | None = None  # as `Observation.relative`
     # The task's own verdict; None: the contact point is within `d_success` of the target.
     success: Bool[Array, ""] | None = None
 
@@ -72,7 +73,7 @@ class Course(Protocol):
         ...
 
 
-def heading_of(course: Course | Task) -> Any:
+def heading_of(course: Course | Task) -> Entries:
     """Return the heading of a course's goal [rad], or a task's range of it; None without one.
 
     It is the field `heading` of either.
@@ -104,7 +105,7 @@ class Task:
     FAILURES: ClassVar[dict[str, str]] = {}
 
     @classmethod
-    def read(cls, file: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    def read(cls, file: JsonObject, values: JsonObject) -> JsonObject:
         """Return fields from those `MARKS` of a mapping that are no fields, and its `values`."""
         return {}
 

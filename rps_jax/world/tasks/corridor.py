@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
+from typing import Annotated, ClassVar, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -70,7 +70,7 @@ class CorridorCourse(NamedTuple):
     path: PathCourse
     walls: Float[Array, "*B W 2 2"]  # [m] both ends of each
     # Of an object that may touch walls: fields of `scene.Surroundings`.
-    surroundings: dict[str, Any] | None = None
+    surroundings: dict[str, Entries] | None = None
     # [m] from the path, within which there are no other walls; what gets beyond it touches one.
     reach: Floats | None = None
 
@@ -261,10 +261,10 @@ class Corridor(Path):
             rule = "it must leave room for its corners: give fewer or smaller turns, longer parts"
             raise errors.not_allowed("task width (high)", f"{self.width.high:g} m", rule)
         if self.waypoints:
-            half: Any = np.array([self.width.high / 2])
+            half: Entries = np.array([self.width.high / 2])
             route = self.route()
             path = PathCourse(Polyline.through(route[None]), half)
-            walls: Any = CorridorCourse.around(path, half, half, self.doors).walls
+            walls: Entries = CorridorCourse.around(path, half, half, self.doors).walls
             (a, b), line = (walls[0] @ (1, 1j)).T[..., None], route @ (1, 1j)
             away = distances(a, b, line[:-1], line[1:]).min(axis=0)
             if away.min() < 0.999 * half:

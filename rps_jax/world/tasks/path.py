@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -127,9 +127,9 @@ class Following(Task):
     # Along the path, from its nearest point to the law's target.
     lookahead: Annotated[Range, LOOKAHEAD] = Range(1.6, 1.6)
 
-    def measures(self, course: Any) -> Arrays:
+    def measures(self, course: Pytree) -> Arrays:
         """Return length, number of turns and their mean angle."""
-        line: Any = getattr(course, "path", course).line
+        line: Pytree = getattr(course, "path", course).line
         angles = np.abs(turns_of(np.asarray(line.vertices)))
         count = (angles > 1e-9).sum(axis=1)
         angle = angles.sum(axis=1) / np.maximum(count, 1)
@@ -194,7 +194,7 @@ class Path(Following):
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Pytree]:
         """Return the ends and the paths of worlds."""
         vertices = self.vertices(inputs)
-        lookahead: Any = self.lookahead.at(inputs.u["lookahead"])
+        lookahead: Entries = self.lookahead.at(inputs.u["lookahead"])
         return vertices[:, -1], PathCourse(Polyline.through(vertices), lookahead)
 
     def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,7 +32,7 @@ class Nothing(NamedTuple):
         """Return the distance to the target."""
         return planar.norm(p_world_goal - point)
 
-    def outcomes(self) -> dict[str, Any]:
+    def outcomes(self) -> dict[str, Array]:
         """Return no outcomes."""
         return {}
 

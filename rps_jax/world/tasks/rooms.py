@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import io
 import warnings
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,9 +24,10 @@ from PIL import Image
 
 from rps_jax import errors
 from rps_jax.geometry import polyline
-from rps_jax.geometry.arrays import Pytree
+from rps_jax.geometry.arrays import Entries, Number, Pytree
 from rps_jax.geometry.polyline import Polyline, distances, is_inside, to_segment
 from rps_jax.record import files
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Quantity, Range
@@ -37,6 +38,7 @@ from rps_jax.world.tasks.path import LOOKAHEAD, Following, PathCourse
 # Fields of a ROS map, and those that Nav2 ignores.
 _ROS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 _IGNORED = ("map_type", "frame_id")
+Graph = scipy.sparse.csr_array
 _UNKNOWN = 205  # grey of unknown cells, as maps are saved
 _OUTSIDE = "it lies in an obstacle or outside of the room (of an image, try a smaller tolerance)"
 _MAX_WALLS = 4096
@@ -77,7 +79,7 @@ class Rooms(Following):
     object_radius: float = option(0.25, 0, 5, unit="m")
 
     @classmethod
-    def read(cls, file: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    def read(cls, file: JsonObject, values: JsonObject) -> JsonObject:
         """Return the walls of polygons, an outline and an image."""
         polygons: Any = file.get("polygons", ())
         polygons = polygons if np.iterable(polygons) else [polygons]
@@ -183,13 +185,13 @@ class Rooms(Following):
         # The first two are at the start, and straight ahead: the path begins at the base's front.
         vertices[:, :2, 0] = np.maximum(vertices[:, :2, 0], inputs.front[:, None])
         near, reach = self._near
-        walls: Any = _placed(near[route], starts, scale).reshape(route.size, -1, 2, 2)
+        walls: Entries = _placed(near[route], starts, scale).reshape(route.size, -1, 2, 2)
         path = PathCourse(Polyline.through(vertices), lookahead)
         course = CorridorCourse(path, walls, reach=None if reach is None else reach[route] * scale)
         return vertices[:, -1], course
 
 
-def _placed(points: np.ndarray, starts: np.ndarray, scale: Any) -> np.ndarray:
+def _placed(points: np.ndarray, starts: np.ndarray, scale: Number) -> np.ndarray:
     """Return points (..., K) of the map in worlds (n, K, 2) [m] of starts (n, 3)."""
     moved = points - (starts @ (1, 1j, 0))[:, None]
     moved = moved * (scale * np.exp(-1j * starts[:, 2]))[:, None]
@@ -217,7 +219,7 @@ def _ring(name: str, corners: object) -> np.ndarray:
     return points
 
 
-def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
+def _read_image(file: JsonObject, starts: object) -> list[np.ndarray]:
     """Return the outlines (N,) [m] of the part of a ROS map that starts (S, 3) can reach."""
     check = functools.partial(errors.check_finite, at_least=0)
     resolution = check("task resolution", file.get("resolution"), at_least=1e-3, unit="m")
@@ -231,7 +233,7 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
         texts[name] = str(file.get(name, allowed[0])).lower().removesuffix(".0")
         if texts[name] not in allowed:
             raise errors.not_allowed(f"task {name}", file[name], f"give one of {list(allowed)}")
-    shades = _shades(Path(str(file.get("image", "an image"))))[::-1]
+    shades = shades_of(file)
     occupied = shades if texts["negate"] in ("1", "true") else 1 - shades
     # Unknown cells, and those outside, are walls.
     free = (occupied < low) & (occupied <= high)
@@ -280,8 +282,9 @@ def _warn_once(sentence: str) -> None:
     warnings.warn(sentence, stacklevel=3)
 
 
-def _shades(path: Path) -> np.ndarray:
-    """Return the brightness (rows, columns) of an image, from 0 to 1."""
+def shades_of(file: JsonObject) -> np.ndarray:
+    """Return the brightness (rows from below, columns) of the image of a map, from 0 to 1."""
+    path = Path(str(file.get("image", "an image")))
     content = io.BytesIO(files.read_regular(path, "image"))
     try:
         with warnings.catch_warnings(action="ignore"):  # a large image is an error
@@ -289,9 +292,9 @@ def _shades(path: Path) -> np.ndarray:
         if image.width * image.height > _MAX_PIXELS:
             raise ValueError(f"it has {image.width} x {image.height} pixels")
         if image.mode.startswith("I"):
-            return np.asarray(image) / 65535
+            return np.asarray(image)[::-1] / 65535
         colours = image.convert("RGBA" if image.has_transparency_data else "RGB")
-        return np.asarray(colours).mean(axis=2) / 255
+        return np.asarray(colours)[::-1].mean(axis=2) / 255
     except Exception as error:  # of any kind, by Pillow on damaged files
         rule = f"give a PGM, PNG or BMP file of at most 16 million pixels ({error})"
         raise errors.not_allowed("task image", path, rule) from error
@@ -364,7 +367,9 @@ def _plan(walls: Any, starts: Any, goals: Any, base_radius: float, radius: float
     return np.array([np.pad(route, (0, size - len(route)), "edge") for route in routes])
 
 
-def _sight_lines(nodes: np.ndarray, a: Any, b: Any, clearance: float) -> tuple[np.ndarray, Any]:
+def _sight_lines(
+    nodes: np.ndarray, a: Entries, b: Entries, clearance: float
+) -> tuple[np.ndarray, Graph]:
     """Return nodes with those about the corners of walls, and the graph of their sight lines."""
     around = (np.unique([a, b])[:, None] + clearance * _TURN).ravel()
     is_clear = distances(around[:, None], around[:, None], a, b).min(axis=1) > clearance
@@ -376,7 +381,7 @@ def _sight_lines(nodes: np.ndarray, a: Any, b: Any, clearance: float) -> tuple[n
     return nodes, scipy.sparse.csgraph.csgraph_from_dense(lengths, np.inf)
 
 
-def _grid(nodes: np.ndarray, a: Any, b: Any, clearance: float) -> tuple[np.ndarray, Any]:
+def _grid(nodes: np.ndarray, a: Entries, b: Entries, clearance: float) -> tuple[np.ndarray, Graph]:
     """Return nodes with the clear points of a grid, and the graph of their eight neighbours."""
     low, size = complex(a.real.min(), a.imag.min()), (np.ptp(a.real), np.ptp(a.imag))
     cell = max(clearance / 5, np.sqrt(np.prod(size) / _MAX_CELLS))
@@ -404,7 +409,7 @@ def _grid(nodes: np.ndarray, a: Any, b: Any, clearance: float) -> tuple[np.ndarr
     return vertices, scipy.sparse.csr_array((lengths, (first, second)), shape=2 * (vertices.size,))
 
 
-def _away_from_walls(points: np.ndarray, a: Any, b: Any, clearance: float) -> np.ndarray:
+def _away_from_walls(points: np.ndarray, a: Entries, b: Entries, clearance: float) -> np.ndarray:
     """Return lower bounds [m] of the distances of points from walls, infinite beyond twice this.
 
     They are lower by at most a hundredth of the clearance.
@@ -417,7 +422,7 @@ def _away_from_walls(points: np.ndarray, a: Any, b: Any, clearance: float) -> np
     return np.sqrt(np.maximum(away**2 - step**2 / 4, 0))
 
 
-def _straighten(path: np.ndarray, a: Any, b: Any, clearance: float) -> np.ndarray:
+def _straighten(path: np.ndarray, a: np.ndarray, b: np.ndarray, clearance: float) -> np.ndarray:
     """Return those points (N,) of a path that straight lines clear of walls join."""
     corners, i = [0], 0
     while i < path.size - 1:
