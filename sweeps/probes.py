@@ -115,7 +115,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "real_pushes_*": ("real_pushes",),
     **dict.fromkeys(("gradients_mjx", "gradients_stiff"), ("mjx",)),
     "gradients_tables": ("tune_grad", "wide", "hostile"),
-    "gradients_*": ("tune_grad",),
+    "gradients_*": ("tune_grad", "wide"),
     "learned_windows": ("tune_grad", "learn", "learned"),
     **dict.fromkeys(("ground", "straight"), ("push_mujoco", "push_fused")),
     "support*": ("wide", "hardware"),
