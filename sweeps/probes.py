@@ -137,7 +137,9 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(
         ("arena", "commands*", "compilers*", "costs", "derivatives*", "environments*", "gpus"), ()
     ),
-    **dict.fromkeys(("kernel", "levers", "moved", "robot", "speed*", "stages", "tasks_cost_*"), ()),
+    **dict.fromkeys(
+        ("kernel", "levers", "moved", "robot", "speed*", "stages*", "tasks_cost_*"), ()
+    ),
     "maps": ("corridor",),
 }
 

@@ -54,9 +54,7 @@ STALE: dict[str, str] = {
         ),
         "tuners got worlds of their own, which no sweep meets",
     ),
-    **dict.fromkeys(
-        ("ground", "straight"), "a push ran in the program of a sweep, with other last bits"
-    ),
+    **dict.fromkeys(("ground",), "a push ran in the program of a sweep, with other last bits"),
     **dict.fromkeys(
         ("engines_ideal", "engines_wide", "tasks_parity"),
         "objects got supports, with other last bits of C MuJoCo",

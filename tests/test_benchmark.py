@@ -13,6 +13,7 @@ import xarray as xr
 from helpers import refusing
 from numpy.testing import assert_allclose
 
+from rps_jax import __version__
 from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_colliders
 from rps_jax.engines.base import ControlPeriod
@@ -191,27 +192,35 @@ def test_whole_commands_are_timed_twice_per_gpu_count(monkeypatch):
 def test_sweeps_are_timed_on_the_gpus_of_the_host(monkeypatch):
     calls = []
 
-    def printed(words, label, folder, limit, count):
+    def printed(words, label, folder, limit, count, environment):
         calls.append((label, count))
+        assert environment is None or environment["PYTHONPATH"].startswith("checkouts/0.4.0:")
         segments = [[0, 1.0, 2.0, 4000, 3000, 0], [0, 1.5, 2.0, 4, 0, 0], [1, 1.0, 4.0, 9, 0, 0]]
         segments = [x for x in segments if x[0] < count]
         traced = f"a line\n{segments}\n"
         return traced if words[0] == "-c" else "compile 0.2 s, run 3.0 s (900 simulated s per s)", 1
 
     monkeypatch.setattr(gpus, "printed", printed)
-    monkeypatch.setattr(gpus, "run_process", lambda *_: "GPU 0: H100\nGPU 1: H100\n")
-    study = gpus.Gpus(worlds=(20, 10))
+    sweeps = ("5:1", "20:1", "20:2", "10:2", "10:1", "10:2:checkouts/0.4.0")
+    study = gpus.Gpus(sweeps=sweeps)
     (table,) = study.report_tables(study.answer(Run(None, no_progress)))
-    assert [row[:2] for row in table.rows[1:]] == [
-        ["20", "1"],
-        ["20", "2"],
-        ["10", "1"],
-        ["10", "2"],
+    own, other = __version__, "0.4.0"
+    assert [row[:3] for row in table.rows[1:]] == [
+        ["5", "1", own],
+        ["20", "1", own],
+        ["20", "2", own],
+        ["10", "2", own],
+        ["10", "1", own],
+        ["10", "2", other],
     ]
-    assert [row[-1] for row in table.rows[1:]] == ["", "", "50 %", "50 %"]
-    assert sorted(count for label, count in calls if "horizon" in label) == [1, 1, 2, 2]
+    assert [row[-1] for row in table.rows[1:]] == ["", "", "", "50 %", "50 %", ""]
+    assert [bool(row[4]) for row in table.rows[1:]] == [True, True, True, True, True, False]
+    assert sorted(count for label, count in calls if "horizon" in label) == [1, 1, 1, 2, 2, 2]
     assert sum("segment" in label for label, _ in calls) == 2
     assert table.picture.png()
+    for text in ("1000", "1000:0", "a:1", "1000:1:"):
+        with refusing("write WORLDS:GPUS"):
+            gpus.Gpus(sweeps=(text,)).validate()
 
 
 def test_step_times_on_a_robot_are_parsed_from_the_examples_output(monkeypatch):

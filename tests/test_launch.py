@@ -48,7 +48,9 @@ def folder(tmp_path_factory):
         codes.append(folder / f"{digit}.cubin")
         codes[-1].write_text(digit)
     for library, count in (("launcher", 2), ("single", 1)):
-        text = nvrtc.launcher(NAME, codes[:count], [(2, 1, 0, 1)] * count, worlds=8)
+        text = nvrtc.launcher(
+            NAME, codes[:count], [(2, 1, 0, 1, 100), (2, 1, 0, 1, 200)][:count], worlds=8
+        )
         (folder / f"{library}.so").write_bytes(native._library(text, NAME))
     words = [str(COMPILER), "-O1", "-w", "-shared", "-fPIC", "-Wl,-soname,libcuda.so.1"]
     words += [f"-I{jax.ffi.include_dir()}", str(Path(__file__).with_name("launch.c"))]
@@ -68,7 +70,8 @@ def test_kernels_run_concurrently_and_later_work_waits_for_all(folder):
     assert (error, traits) == ("", 0)
     assert_array_equal(results[0], 3 * np.arange(2))
     assert_array_equal(results[1], 5 * np.arange(20))
-    loaded = ["mode 2", "load 3", "kernel step", "load 5", "kernel step", "mode 1"]
+    loaded = ["mode 2", "load 3", "kernel step", *["shared 400 of 3"] * 2]
+    loaded += ["load 5", "kernel step", *["shared 400 of 5"] * 2, "mode 1"]
     assert first == [
         *loaded,
         "context",
@@ -76,12 +79,12 @@ def test_kernels_run_concurrently_and_later_work_waits_for_all(folder):
         "mode 2",
         "event 201",
         "record 201 on 7",
-        "launch 3 on 7: 1 of 32",  # 8 worlds in a block of 32 threads
+        "launch 3 on 7: 1 of 32, 100",  # 8 worlds in a warp of 32 threads
         # Earlier work of XLA's stream comes first.
         "stream 101",
         "event 202",
         "await 201 on 101",
-        "launch 5 on 101: 3 of 32",
+        "launch 5 on 101: 2 of 64, 400",  # 20 worlds in 3 warps, of which 2 share a block
         "record 202 on 101",
         "await 202 on 7",
         "end event 202",
@@ -90,7 +93,7 @@ def test_kernels_run_concurrently_and_later_work_waits_for_all(folder):
         "mode 1",
         "pop",
     ]
-    assert [line.split()[0] for line in second] == [line.split()[0] for line in first[6:]]
+    assert [line.split()[0] for line in second] == [line.split()[0] for line in first[10:]]
 
 
 def test_a_single_kernel_can_be_captured_in_a_cuda_graph(folder):
@@ -98,8 +101,9 @@ def test_a_single_kernel_can_be_captured_in_a_cuda_graph(folder):
     ((error, first), (_, second)), result, _, traits = launched(folder, library="single")
     assert (error, traits) == ("", 1)
     assert_array_equal(result, 3 * np.arange(2))
-    call = ["context", "push 7", "mode 2", "launch 3 on 7: 1 of 32", "mode 1", "pop"]
-    assert first == ["mode 2", "load 3", "kernel step", "mode 1", *call]
+    call = ["context", "push 7", "mode 2", "launch 3 on 7: 1 of 32, 100", "mode 1", "pop"]
+    loaded = ["mode 2", "load 3", "kernel step", *["shared 400 of 3"] * 2, "mode 1"]
+    assert first == [*loaded, *call]
     assert second == call
 
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import jitted, refusing, rps
 from numpy.testing import assert_allclose
 
@@ -15,7 +16,7 @@ import rps_jax
 from rps_jax import Details, Law, Twist
 from rps_jax.control import registry
 from rps_jax.control.laws.pose import Box, PoseParams, feel
-from rps_jax.control.observation import EndsObservation, Observation
+from rps_jax.control.observation import EndsObservation, Observation, PoseObservation
 from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.quasistatic import Quasistatic, Slider
 from rps_jax.geometry import footprint as fp
@@ -29,6 +30,8 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.tasks import parse_task
 from rps_jax.world.tasks.base import Positions
 from rps_jax.world.tasks.pose import PoseCourse
+from sweeps.pose.sight import SightParams, sight_table
+from sweeps.pose.study import OUTCOMES, pose_table
 
 GOAL, HEADING = np.array([1.0, 0.5]), 0.7
 NO = jnp.zeros((), bool)
@@ -123,6 +126,44 @@ def test_a_law_that_can_declare_is_judged_by_its_word(declared):
     assert bool(aim.success) == declared == bool(progress.declared)
 
 
+def test_the_reference_of_a_turn_is_the_first_flush_face():
+    """The heading of the base counts, from the first step in which the face is flush."""
+    turned = course()._replace(heading=jnp.asarray(1.5), relative=jnp.ones(()))
+    box, progress = fp.rectangle(0.3, 0.3), turned.start()
+
+    def step(tilt, base_yaw, progress, touches=True):
+        normal = unit(base_yaw)
+        at = positions(box, GOAL + 0.3 * normal, base_yaw + tilt, GOAL, touches)
+        at = at._replace(base=jnp.array([0.0, 0.0, base_yaw]))
+        return jitted(PoseCourse.step)(turned, progress, at)
+
+    for tilt, touches in ((0.0, False), (0.3, True), (-0.12, True)):
+        progress, aim = step(tilt, 0.4, progress, touches)
+        assert np.isnan(progress.errors).all()
+        assert not aim.success
+    progress, aim = step(0.05, 0.4, progress)
+    assert float(progress.first) == pytest.approx(0.4)
+    assert float(progress.errors[2]) == pytest.approx(1.5 - 0.05, abs=2e-6)
+    progress, aim = step(0.0, 1.9, progress)
+    assert float(progress.first) == pytest.approx(0.4)
+    assert float(progress.errors[2]) == pytest.approx(0, abs=2e-6)
+    assert aim.success
+    assert aim.relative
+
+
+def test_the_law_finds_a_relative_heading_by_a_flush_face():
+    """Equal pushes: straight ahead until the face is flush, then as with the absolute heading."""
+    setting = Setting("quasistatic", rules=Rules(horizon=250.0))
+    case = {"law": FAST, "target": (1.2, 0.5), "setting": setting}
+    trace = rps_jax.push(task="pose,turn=1.57", **case)
+    yaws = trace.snapshots.qpos[:, 2]
+    assert trace.outcome.success
+    touches = trace.snapshots.reading.contact_type > 0
+    assert_allclose(yaws[: touches.argmax() + 4], 0, atol=1e-5)
+    assert trace.outcome.task["heading_error"] < 0.02
+    assert np.sin(float(trace.outcome.base_pose[2]) - 1.57) == pytest.approx(0, abs=0.03)
+
+
 class WaitParams(NamedTuple):
     wait: float = 1.0  # [s]
     d_success: float = 0.05
@@ -151,6 +192,9 @@ def test_the_word_of_a_law_ends_a_trial(task, registries):
 CASES = {
     "push --task pose,heading=90": "task heading = 90 is not allowed: it is beyond 2 pi: give rad",
     "sweep --task pose,heading=0:7": "task heading = 7 is not allowed: it is beyond 2 pi",
+    "push --task pose,turn=90": "task turn = 90.0 is not allowed: it must be a number and at",
+    "push --task pose,turn=x": "task turn = x is not allowed",
+    "sweep --task pose,turn=1,heading=1": "task heading = 1 to 1 is not allowed: its turn",
     "push --task pose,d_success=0": "task d_success = 0",
     "push --task pose,yaw_success=0": "task yaw_success = 0",
     "push --task pose --target 0.6 0.1": r"target = \(0.6, 0.1\) m is not allowed: the object st",
@@ -378,6 +422,48 @@ def test_the_smooth_law_mixes_its_pushes_by_the_weight_of_the_contact():
     numeric = (weigh(jnp.asarray(0.91), 0.2) - weigh(jnp.asarray(0.89), 0.2)) / 0.02
     assert_allclose(by_weight, numeric, atol=2e-4)
     assert by_gain[1] > 1e-3
+
+
+def test_a_trial_without_a_touch_leaves_no_nan_in_the_table():
+    """A law may give up before its first touch; its errors are NaN then."""
+    errors = {"place_error": 0.01, "sideways_error": 0.02, "heading_error": 0.03}
+    values = dict.fromkeys(OUTCOMES, 1.0) | errors
+    trials = xr.Dataset({x: (("row", "world"), np.full((1, 4), v)) for x, v in values.items()})
+    for name in errors:
+        trials[name].values[0, 3] = np.nan
+    rows = pose_table(trials.assign_coords(row=["wide | omni | fast"]))
+    assert rows[1][3].startswith("75")
+    assert rows[1][-2:] == ["20 mm / 20 mm", "0.0300 rad / 0.0300 rad"]
+
+
+def test_a_planner_solves_what_the_law_or_one_of_its_tries_solves():
+    """Sight is no part of it."""
+    laws = ["touch", "sight", "try 0", "try 1"]
+    place = np.array([[0.01, 0.2, 0.2, 0.2], [0.01, 0.01, 0.2, 0.2], [0.2, 0.2, 0.04, 0.2]])
+    place = np.concatenate([place, np.full((1, 4), np.nan)])[None]
+    names = ("row", "law", "world")
+    trials = {"place_error": (names, place), "heading_error": (names, 0 * place)}
+    trials["declared"] = (names, np.ones(place.shape))
+    rows = sight_table(xr.Dataset(trials, {"row": ["wide | omni | fast"], "law": laws}))
+    shares = [[cell.split(" %")[0] for cell in row[2:]] for row in rows[1:]]
+    assert shares[0] == ["5 cm", "25.0", "50.0", "1", "0", "50.0"]
+    assert shares[1] == ["2 cm", "25.0", "50.0", "1", "0", "25.0"]
+
+
+def test_a_law_that_sees_knows_the_box_and_its_ends():
+    """It never looks for an end, and it forgets nothing."""
+    law, params = registry.law_of(SightParams(PoseParams())), SightParams(PoseParams())
+    touch = Observation(*(jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, 0.1]), ~NO, jnp.zeros(2)))
+    touch = touch._replace(yaw_target=jnp.zeros(()))
+    corners = np.array([[0.36, -0.2], [0.96, -0.2], [0.96, 0.6], [0.36, 0.6]])
+    obs = PoseObservation(touch, jnp.zeros(2), jnp.zeros(()), jnp.asarray(corners))
+    state = law.init(params)
+    run = jax.jit(lambda s: law.step(params, s, obs)[0])
+    for _ in range(100):
+        state = run(state)
+    assert_allclose(state.h, [0.96, 0.6, -0.36, 0.2], atol=4e-3)
+    assert state.known.all()
+    assert int(state.looks) == 0
 
 
 def test_tolerances_are_options_of_the_task():

@@ -15,11 +15,13 @@
 #define __forceinline__ inline
 #define __launch_bounds__(...)
 #define __grid_constant__
-#define __shared__ static
+#define __shared__
+#define __syncthreads __syncwarp
 using std::min;
 
 struct Positions { int x; };
-static Positions threadIdx, blockIdx;
+static Positions threadIdx, blockIdx, blockDim = {32};
+unsigned shared_of_block[48 << 8];
 static ucontext_t fibers[32], caller;
 static char stacks[32][1 << 18];
 static uint32_t words[2][32];

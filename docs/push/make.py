@@ -24,7 +24,7 @@ import numpy as np
 from rps_jax import __version__
 from rps_jax.control import registry, validation
 from rps_jax.control.learned import features
-from rps_jax.control.observation import TaxelObservation, Twist, with_base
+from rps_jax.control.observation import Twist, with_base
 from rps_jax.engines import quasistatic
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry.polyline import Polyline
@@ -46,6 +46,7 @@ from rps_jax.world.scene import FRICTION
 from rps_jax.world.tasks import corridor, path, reach
 from rps_jax.world.tasks.base import CourseInputs
 from rps_jax.world.tasks.corridor import CorridorCourse
+from rps_jax.world.tasks.pose import PoseCourse
 
 HERE = Path(__file__).parent
 RECORDED = HERE / "recorded.json"
@@ -62,8 +63,9 @@ LAWS = {
         "rps_tuned": "RPS, tuned by evolution",
         "rps_plus": "RPS+",
         "learned": "a network that learned from touch",
+        "pose": "deliver to a pose",
     },
-    "differential": {"unicycle": "push and reposition"},
+    "differential": {"unicycle": "push and reposition", "pose_drive": "deliver to a pose"},
     "car": {"unicycle_car": "push and reposition, for cars"},
 }
 NUM_CORNERS = {"cylinder": 1, "prism": 6}  # by family; a box repeats two corners
@@ -72,12 +74,20 @@ TASKS = {
     "reach": "reach the target",
     "path": "follow a path",
     "corridor": "follow a corridor",
+    "pose": "reach the target with a heading",
 }
+TOLERANCES = tasks.TASKS["pose"].d_success, tasks.TASKS["pose"].yaw_success
 NUM_VERTICES = 17  # of each path on the page
 ENDLESS = Rules(horizon=1e5, max_lost=1e5)
 SETTING = Setting("quasistatic", rules=ENDLESS)
 # Bounds of parameters of the robot and the task, for which a law has none.
-TASK = {"v_max": (0.01, 0.1), "omega_max": (0.03, 0.5), "d_success": (0.02, 0.2)}
+TASK = {
+    "v_max": (0.01, 0.1),
+    "omega_max": (0.03, 0.5),
+    "d_success": (0.02, 0.2),
+    "v_free": (0.05, 0.3),
+    "omega_free": (0.1, 1.0),
+}
 UNTRACED: dict[str, Any] = {
     "skin": None,
     "poses": None,
@@ -94,15 +104,16 @@ class Arrival(NamedTuple):
 
 
 class Route(NamedTuple):
-    """Path and corridor, as users choose them."""
+    """Path, corridor and heading, as users choose them."""
 
-    vertices: Any  # (NUM_VERTICES, 2) [m]; the last may be repeated
+    vertices: Any  # (NUM_VERTICES, 2) [m]; the last may be repeated, and is the goal
     lookahead: Any  # () [m]
     width: Any  # () [m]
     door: Any  # () [1] width of the door, of the corridor's
+    heading: Any  # () [rad] of the goal
 
 
-ROUTE = Route(np.linspace((0.4, 0.0), (5.0, 0.0), NUM_VERTICES), *np.array([1.0, 1.6, 1.0]))
+ROUTE = Route(np.linspace((0.4, 0.0), (5.0, 0.0), NUM_VERTICES), *np.array([1.0, 1.6, 1.0, 0.0]))
 
 
 class Outline(NamedTuple):
@@ -162,6 +173,9 @@ def course(kind: str, route: Route) -> Any:
         "reach": lambda: reach.Nothing(),
         "path": lambda: follow,
         "corridor": lambda: CorridorCourse.around(follow, half, half * route.door, 1),
+        "pose": lambda: PoseCourse(
+            route.vertices[None, -1], *(jnp.reshape(x, 1) for x in (route.heading, *TOLERANCES))
+        ),
     }
     return jax.tree.map(lambda x: x[0], courses[kind]())
 
@@ -205,16 +219,21 @@ def family_routines(family: str) -> list[Routine]:
     live = {**dict.fromkeys(constants), "fields": None, "task": None}
     blank = {name: getattr(start, name) for name in UNTRACED}
 
-    def sense(world: Any, params: Any, state: Any, course: Any, progress: Any) -> Any:
+    def sense(world: Any, params: Any, state: Any, course: Any, progress: Any, *memory: Any) -> Any:
+        """Sense, and judge a law that declares that it is done by its `memory`."""
         full = world._replace(**constants, task=course)
-        loop = trial.ControlLoop(physics, SETTING.rules)
-        state = state._replace(**blank | {"task": progress})
+        loop, sense, done = trial.ControlLoop(physics, SETTING.rules), "taxels", {}
+        if memory:
+            loop = replace(loop, law=replace(loop.law, is_done=lambda state: state))
+            sense, done = "ends", {"law_state": memory[0]["done"]}
+        state = state._replace(**blank | done | {"task": progress})
         state, sensing = trial.observe(full, params, state, loop)
         outline = trial.outline(full, state.qpos)
         touch = sensing.observation._replace(in_contact=sensing.reading.contact_type != NONE)
-        taxels = features.taxel_observation(touch, sensing.reading, full.skin, state.skin, outline)
+        skin = full.skin, state.skin, outline
+        observation = features.OBSERVATIONS[sense](touch, sensing.reading, *skin)
         contact = {"contact_type": sensing.reading.contact_type}
-        return state._replace(**UNTRACED), taxels, contact, state.task
+        return state._replace(**UNTRACED), observation, contact, state.task
 
     def drive(fields: Any, previous: Any, state: Any, twist: Any) -> Any:
         # Without noise the key is unused; JavaScript has no number for it.
@@ -243,7 +262,12 @@ def family_routines(family: str) -> list[Routine]:
             routine(
                 f"sense_{family}_{kind}",
                 sense,
-                {**sense_shapes, "course": _shapes(item), "progress": _shapes(item.start())},
+                {
+                    **sense_shapes,
+                    "course": _shapes(item),
+                    "progress": _shapes(item.start()),
+                    **({"memory": {"done": _shapes(False)}} if kind == "pose" else {}),
+                },
                 ["sensed", "observation", "reading", "progress"],
             )
             for kind, item in courses.items()
@@ -257,10 +281,7 @@ def law_routines(base: str, name: str, title: str) -> tuple[list[Routine], dict[
     label, params = registry.resolve_law(name)
     law, kind = registry.law_of(params), f"{type(params).__name__}_{base}"
     robot = Robot.parse(BASES[base][1])
-    observation = validation.observation_shapes(law.senses)
-    if isinstance(observation, TaxelObservation):
-        count = Robot().shell.count
-        observation = observation._replace(signal=jax.ShapeDtypeStruct((count,), np.float64))
+    observation = validation.observation_shapes(law.senses, Robot().shell.count, law.heading)
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), np.float64), params)
     memory = jax.eval_shape(law.init, shapes)
     arguments = {"params": shapes, "memory": memory, "observation": observation}
@@ -286,7 +307,7 @@ def law_routines(base: str, name: str, title: str) -> tuple[list[Routine], dict[
         scale = bounds[bound.relative_to].high if bound.relative_to else 1.0
         about = next(field.about for field in fields if field.name == name_in_js)
         sliders[name_in_js] = [bound.low * scale, bound.high * scale, bound.log, about]
-    description = {"title": title, "base": base, "kind": kind}
+    description = {"title": title, "base": base, "kind": kind, "heading": law.heading}
     return routines, {label: description | {"params": values, "sliders": sliders}}
 
 

@@ -258,7 +258,7 @@ def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, 
     moments = pushes.watch(take.part, setting, interval=interval * period, slots=take.slots)
     for trials, moment, outcomes in moments:
         contacts = np.asarray(trial.p_world_contact(moment))
-        states = [rows((*take.part.inputs, trials.law_state), i) for i in range(len(ended))]
+        states = [rows((take.part.inputs[1], trials.law_state), i) for i in range(len(ended))]
         modes, objects = zip(*(memory_of(*x) for x in states), strict=True)
         times = trials.steps * period
         status = map(_status, trials.done, trials.success, times, modes)

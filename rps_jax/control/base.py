@@ -166,8 +166,7 @@ class Law(Generic[Params, State, Obs]):
     heading: bool = False
     # state -> bool: whether the law declares that it is done, which ends the trial.
     is_done: Callable[[State], jax.Array] | None = None
-    # (state, goal) -> Memory of one trial; the goal (3,) [m, m, rad] has position and heading.
-    memory: Callable[[State, np.ndarray], Memory] | None = None
+    memory: Callable[[State], Memory] | None = None  # state -> Memory of one trial
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None
 

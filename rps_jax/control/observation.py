@@ -22,7 +22,6 @@ from rps_jax.geometry.arrays import (
     Vector,
 )
 from rps_jax.robot.robot import Robot
-from rps_jax.robot.skin import Ends
 from rps_jax.spec import Spec
 
 # Displacements are clipped to this distance [m], so that no finite float32 overflows.
@@ -59,6 +58,10 @@ class Observation(NamedTuple):
     yaw_target: Annotated[
         Scalar | None, Spec("rad", "heading of the goal, the direction of the last push; or None")
     ] = None
+    relative: Annotated[
+        Scalar | None,
+        Spec("1", "1: yaw_target is relative to the face that is first felt flush; or None"),
+    ] = None
 
     def with_base(self, radius: Number | None, robot: Robot | None = None) -> Observation:
         """Return it with the static facts of a base.
@@ -71,7 +74,7 @@ class Observation(NamedTuple):
             facts |= {"half_length": robot.half_length}
         return self._replace(**facts)
 
-    def with_ends(self, signal: Array, alive: Array, ends: Ends) -> EndsObservation:
+    def with_ends(self, signal: Array, alive: Array, ends: tuple[Array, ...]) -> EndsObservation:
         """Return it with the signals (T,) of taxels, whether these work, and the ends."""
         return EndsObservation(self, signal, alive, *ends)
 
@@ -131,6 +134,10 @@ class PoseObservation(NamedTuple):
     touch: Observation
     p_world_object: Annotated[Vector, Spec("m", "position of the object in the world")]
     r_object: Annotated[Scalar, Spec("m", "radius of the object's outline")]
+    corners: Annotated[
+        Float[Array, "N 2"] | None,
+        Spec("m", "corners of this outline in the robot frame; None unless the law has a heading"),
+    ] = None
 
 
 AnyObservation = (

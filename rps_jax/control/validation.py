@@ -65,7 +65,7 @@ def observation_shapes(
         "taxels": TaxelObservation(touch, signal, flag),
         "ends": EndsObservation(touch, signal, flags(taxels), shape(2), flags(2), flag, shape()),
         "force": ForceObservation(touch, shape(2)),
-        "pose": PoseObservation(touch, shape(2), shape()),
+        "pose": PoseObservation(touch, shape(2), shape(), shape(4, 2) if heading else None),
     }
     return observations[senses]
 

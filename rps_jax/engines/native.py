@@ -45,7 +45,7 @@ from rps_jax.engines import device
 from rps_jax.geometry import vectors
 from rps_jax.geometry.arrays import Pytree
 from rps_jax.lowering import nvrtc
-from rps_jax.lowering.gpu import WARP, GpuWriter
+from rps_jax.lowering.gpu import WARP, GpuWriter, shared_size
 from rps_jax.lowering.graph import CompilerError, TooLargeError, UnsupportedError, first_array
 from rps_jax.lowering.writer import HANDLER, SimdWriter
 from rps_jax.record import cache
@@ -514,14 +514,19 @@ def _library(text: str, name: str) -> bytes:
 
 
 def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function], worlds: int) -> bytes:
-    """Compile kernels with so many `worlds` in a block, and the library that launches them.
+    """Compile kernels with so many `worlds` in a warp, and the library that launches them.
 
     Raises:
       CompilerError: the compiler fails.
     """
     shapes = [
-        (len(x.trace.inputs) + x.is_sorted, len(x.shapes), *first_array(x.trace.inputs))
-        for x in functions
+        (
+            len(x.trace.inputs) + x.is_sorted,
+            len(x.shapes),
+            *first_array(x.trace.inputs),
+            4 * worlds * shared_size(text),
+        )
+        for x, text in zip(functions, texts, strict=True)
     ]
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{k}.cubin" for k in range(len(texts))]

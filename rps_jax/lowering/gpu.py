@@ -17,6 +17,7 @@ from rps_jax.lowering.graph import (
     Array,
     Call,
     DynamicSlice,
+    For,
     Gather,
     Input,
     LoopNode,
@@ -29,6 +30,7 @@ from rps_jax.lowering.graph import (
     Typed,
     Value,
     Values,
+    While,
     flat,
     gathered_scalar,
     size_of,
@@ -137,10 +139,12 @@ struct Arguments {{
   long long worlds;
 }};
 
-extern "C" __global__ void __launch_bounds__(32) step(const __grid_constant__ Arguments a) {{
-  __shared__ unsigned shared[SHARED * WORLDS];
-  const int thread = threadIdx.x % THREADS, world = threadIdx.x / THREADS;
-  const long long number = (long long)blockIdx.x * WORLDS + world;
+extern __shared__ unsigned shared_of_block[];
+extern "C" __global__ void __launch_bounds__(256) step(const __grid_constant__ Arguments a) {{
+  const int thread = threadIdx.x % THREADS, world = threadIdx.x % 32 / THREADS;
+  unsigned *const shared = shared_of_block + threadIdx.x / 32 * (SHARED * WORLDS);
+  const long long number = ((long long)blockIdx.x * blockDim.x + threadIdx.x) / THREADS;
+  if (number - world >= a.worlds) return;
   const bool exists = number < a.worlds;
   const long long index = exists ? number : a.worlds - 1, at = {WORLD};
 {LINES}
@@ -171,6 +175,17 @@ def cross_thread_arrays(nodes: Iterable[Node], results: Iterable[Result]) -> set
         arrays = (a for a in values if isinstance(a, Array) and a.node.width > 1)
         shared |= {a.node.storage for a in arrays if not a.covers(size)}
     return shared
+
+
+def shared_size(text: str) -> int:
+    """Return the numbers of a world in shared memory [4 B] of a printed kernel."""
+    return int(text.partition("#define SHARED ")[2].split()[0])
+
+
+def _depth(node: Node) -> int:
+    """Return the number of loops that are nested in a node, with itself."""
+    inner = max(map(_depth, node.body), default=0) if isinstance(node, LoopNode) else 0
+    return inner + isinstance(node.op, While | For)
 
 
 class GpuWriter(SimdWriter):
@@ -352,6 +367,14 @@ class GpuWriter(SimdWriter):
             packed = sum(x << (4 * i) for i, x in enumerate(scalars))
             return f"(int)({packed:#x}u >> (4 * i) & 15)"
         return f"{self.table(np.array(scalars, np.int32))}[i]"
+
+    def loop_head(self, loop: LoopNode) -> str:
+        """Return the first line of a loop; the warps of a block meet after each control step.
+
+        Then they fetch the same instructions, of which no cache holds a control step.
+        """
+        is_control = isinstance(loop.op, While) and _depth(loop) > 2
+        return "for (;; __syncthreads()) {" if is_control else super().loop_head(loop)
 
     def loop(self, loop: LoopNode) -> list[str]:
         broadcasts, self._broadcasts = self._broadcasts, dict(self._broadcasts)

@@ -1,14 +1,18 @@
 /* Launches kernels for XLA concurrently, each on its own stream. The text before defines the number
    of KERNELS, their IMAGES, the number of INPUTS and OUTPUTS of each, MAX_POINTERS (the largest sum
    of both, and one), the index of an argument that has numbers (SIZED) and its SIZE per world, the
-   WORLDS of a block, and the NAME of the function that XLA calls. */
+   WORLDS of a warp, the bytes of SHARED memory of a warp, and the NAME of the function that XLA
+   calls. */
 
 #include <dlfcn.h>
 #include <pthread.h>
 
 static const char *const images[KERNELS] = {IMAGES};
 static const int num_inputs[KERNELS] = {INPUTS}, num_outputs[KERNELS] = {OUTPUTS};
-static const int sized[KERNELS] = {SIZED}, size[KERNELS] = {SIZE};
+static const int sized[KERNELS] = {SIZED}, size[KERNELS] = {SIZE}, shared[KERNELS] = {SHARED};
+enum { MAX_WARPS = 8 }; /* of a block */
+enum { PROCESSORS = 16, MAX_SHARED = 97, DYNAMIC_SHARED = 8 }; /* attributes of CUDA */
+static int processors, max_shared;
 static void *kernels[KERNELS];
 static int failed;
 static pthread_once_t once = PTHREAD_ONCE_INIT;
@@ -23,7 +27,16 @@ static int (*create_stream)(void **, unsigned), (*destroy_stream)(void *);
 static int (*create_event)(void **, unsigned), (*destroy_event)(void *);
 static int (*record)(void *, void *), (*await)(void *, void *, unsigned);
 static int (*exchange_mode)(int *);
+static int (*count_devices)(int *), (*attribute)(int *, int, int);
+static int (*set_attribute)(int, int, void *, int);
 enum { RELAXED = 2 }; /* mode of a thread that may load kernels while XLA captures a stream */
+
+/* Largest number of warps, a power of two, whose shared memory a block may have. */
+static int most_warps(int k) {
+  int warps = MAX_WARPS;
+  while (warps > 1 && warps * shared[k] > max_shared) warps /= 2;
+  return warps;
+}
 
 static void load_kernels(void) {
   void *cuda = dlopen("libcuda.so.1", RTLD_NOW);
@@ -35,22 +48,32 @@ static void load_kernels(void) {
     {&create_event, "cuEventCreate"}, {&destroy_event, "cuEventDestroy_v2"},
     {&record, "cuEventRecord"}, {&await, "cuStreamWaitEvent"},
     {&exchange_mode, "cuThreadExchangeStreamCaptureMode"},
+    {&count_devices, "cuDeviceGetCount"}, {&attribute, "cuDeviceGetAttribute"},
+    {&set_attribute, "cuKernelSetAttribute"},
   };
   for (unsigned i = 0; i < sizeof all / sizeof *all; i++)
     if (!cuda || !(*(void **)all[i].to = dlsym(cuda, all[i].name))) { failed = -1; return; }
-  int mode = RELAXED;
+  int mode = RELAXED, devices;
   exchange_mode(&mode);
+  failed = count_devices(&devices) || attribute(&processors, PROCESSORS, 0) ||
+           attribute(&max_shared, MAX_SHARED, 0);
   for (int k = 0; k < KERNELS && !failed; k++) {
     void *library;
     failed = load_library(&library, images[k], 0, 0, 0, 0, 0, 0);
     if (!failed) failed = get_kernel(&kernels[k], library, "step");
+    for (int i = 0; i < devices && !failed; i++)
+      failed = set_attribute(DYNAMIC_SHARED, most_warps(k) * shared[k], kernels[k], i);
   }
   exchange_mode(&mode);
 }
 
 static int launch_one(int k, void *arguments, int64_t worlds, void *stream) {
   void *with[] = {arguments};
-  return launch(kernels[k], (worlds + WORLDS - 1) / WORLDS, 1, 1, 32, 1, 1, 0, stream, with, 0);
+  int64_t all = (worlds + WORLDS - 1) / WORLDS;
+  int warps = most_warps(k);
+  while (warps > 1 && all < (int64_t)warps * processors) warps /= 2; /* each processor has some */
+  return launch(kernels[k], (all + warps - 1) / warps, 1, 1, 32 * warps, 1, 1, warps * shared[k],
+                stream, with, 0);
 }
 
 /* Launch the first kernel on a stream and each other on a new stream; return 0, or CUDA's error code.

@@ -82,7 +82,7 @@ def _image(text: str) -> bytes:
 
 
 def launcher(
-    name: str, images: Sequence[Path], shapes: Sequence[tuple[int, int, int, int]], worlds: int
+    name: str, images: Sequence[Path], shapes: Sequence[tuple[int, ...]], worlds: int
 ) -> str:
     """Return the C of the function by which XLA launches kernels.
 
@@ -90,15 +90,16 @@ def launcher(
       name: of the function.
       images: files of the kernels' machine code.
       shapes: for each kernel the number of its arguments and of its results, the index of an
-        argument that has numbers, and how many it has per world.
-      worlds: number of worlds of a block of threads.
+        argument that has numbers, how many it has per world, and the bytes of shared memory
+        of a warp.
+      worlds: number of worlds of a warp.
     """
     counts = [", ".join(map(str, column)) for column in zip(*shapes, strict=True)]
     macros = {
         "NAME": name,
         "KERNELS": len(images),
         "IMAGES": ", ".join(f"image_{k}" for k in range(len(images))),
-        **dict(zip(("INPUTS", "OUTPUTS", "SIZED", "SIZE"), counts, strict=True)),
+        **dict(zip(("INPUTS", "OUTPUTS", "SIZED", "SIZE", "SHARED"), counts, strict=True)),
         "MAX_POINTERS": max(a + b for a, b, *_ in shapes) + 1,
         "WORLDS": worlds,
     }

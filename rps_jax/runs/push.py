@@ -166,7 +166,7 @@ class Trace(Trajectory):
         shown = _evenly_spaced(len(self.snapshots.time), round(seconds * fps))
         contacts = np.asarray(p_world_contact(self.snapshots))[shown]
         states = [rows(self.law_states, i) for i in shown]
-        memories = (memory_of(self.world, self.params, state) for state in states)
+        memories = (memory_of(self.params, state) for state in states)
         poses = watch(self.snapshots.qpos[shown])
         marks = zip(poses, contacts, memories, strict=True)
         shots = ([video.Shot(qpos, at, *memory)] for qpos, at, memory in marks)
@@ -245,7 +245,7 @@ def bag_steps(trajectory: Trajectory, obs: PyTree, period: float) -> Iterator[St
     snapshots, touch = trajectory.snapshots, obs.touch
     lines = {k: x for k, x in trajectory.world.task.lines().items() if k in Step._fields}
     extra = {"signal", "f_robot", "p_world_object", "r_object"} & set(obs._fields)
-    yaws = touch.yaw_target
+    yaws = touch.yaw_target if touch.relative is None else None
     for i in range(len(snapshots.time)):
         position, yaw = object_pose(snapshots.qpos[i])
         yield Step(

@@ -93,8 +93,7 @@ class Live:
 
     def memory_at(self, index: int) -> Memory:
         """Return what the law remembers before a step of `past`."""
-        worlds, state = self.past[index].worlds, self.past[index].trial.law_state
-        return memory_of(*rows((worlds, self._params), 0), state)
+        return memory_of(rows(self._params, 0), self.past[index].trial.law_state)
 
     # --- control ---
 

@@ -326,7 +326,7 @@ def observe(
     positions = positions_of(world, trial.qpos, reading.p_robot_contact, touch, declared)
     task, aim = world.task.step(trial.task, positions)
     aims = {"p_world_target": aim.p_world_target, "yaw_target": aim.yaw_target}
-    observation = observation._replace(**aims)
+    observation = observation._replace(**aims, relative=aim.relative)
     success = aim.success
     if success is None:
         success = touch & (distance < params.d_success) & aim.at_end
@@ -381,7 +381,9 @@ def perceive(
     if not law.smooth:
         obs = obs._replace(in_contact=measured.reading.contact_type != NONE)
     if law.senses == "pose":
-        obs = PoseObservation(obs, object_pose(judged.qpos)[0], fp.circumradius(world.footprint))
+        radius = fp.circumradius(world.footprint)
+        corners = outline(world, judged.qpos).vertices if law.heading else None
+        obs = PoseObservation(obs, object_pose(judged.qpos)[0], radius, corners)
     if law.senses in ("taxels", "ends"):
         skin = world.skin, judged.skin, outline(world, judged.qpos)
         observation = features.OBSERVATIONS[law.senses]

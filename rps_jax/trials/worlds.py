@@ -35,7 +35,6 @@ from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.points import Points
 from rps_jax.world.scene import JOINTS, Friction, Scene, WorldInputs
-from rps_jax.world.tasks.base import heading_of
 
 Tree = TypeVar("Tree")  # a pytree
 Inputs = tuple[World, LawParams]
@@ -92,12 +91,10 @@ class WorldBatch(NamedTuple):
         return first, rest if rest.indices.size else None
 
 
-def memory_of(world: World, params: LawParams, state: Pytree) -> Memory:
-    """Return what the law with a state remembers in a world, for pictures."""
-    target, heading = np.asarray(world.p_world_target, float), heading_of(world.task)
-    yaw = np.arctan2(target[1], target[0]) if heading is None else float(heading)
+def memory_of(params: LawParams, state: Pytree) -> Memory:
+    """Return what the law with a state remembers, for pictures."""
     law = registry.law_of(params)
-    return Memory() if law.memory is None else law.memory(state, np.append(target, yaw))
+    return Memory() if law.memory is None else law.memory(state)
 
 
 class Job(NamedTuple):

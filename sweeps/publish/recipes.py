@@ -311,6 +311,7 @@ RECIPES: dict[str, Recipe] = {
     **dict.fromkeys(
         ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 10000 {_MACHINE}", gpu=2)
     ),
+    "pose_sight": recipe(f"rps sweeps/pose/sight.py {_MACHINE}", gpu=2),
     "drives": recipe(f"rps sweeps/drives {_MACHINE}", cores=35, gpu=6),
     "drives_omni": recipe(
         "rps sweeps/drives --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "
@@ -447,6 +448,11 @@ RECIPES: dict[str, Recipe] = {
     ),
     "commands": recipe(f"rps sweeps/speed/commands.py {_MACHINE}", cores=14),
     "stages": recipe(f"rps sweeps/speed/stages.py {_MACHINE}", cores=1),
+    "stages_gpu": recipe(
+        f"rps sweeps/speed/stages.py --commands '{_SWEPT} --worlds 1000' '{_SWEPT} --worlds 10000' "
+        f"--file stages_gpu {_MACHINE}",
+        gpu=1,
+    ),
     "compilers": recipe(f"rps sweeps/speed/compilers.py {_MACHINE}", cores=5),
     "compilers_gpu": recipe(
         f"rps sweeps/speed/compilers.py --against cpu --worlds 4000 --file compilers_gpu "
@@ -460,7 +466,14 @@ RECIPES: dict[str, Recipe] = {
         + f" --gpus 1 --warm 1000 10000 --file commands_gpu {_MACHINE}",
         gpu=8,
     ),
-    "gpus": recipe(f"rps sweeps/speed/gpus.py --gpus 1 2 {_MACHINE}", gpu=4),
+    "gpus": recipe(  # after version 0.4.0 was checked out into checkouts/0.4.0
+        "rps sweeps/speed/gpus.py --sweeps "
+        + " ".join(f"{x} {x}:checkouts/0.4.0" for x in ("262144:1", "262144:2"))
+        + " 1048576:1"
+        + "".join(f" {x} {x}:checkouts/0.4.0" for x in ("1048576:2", "1000:1", "10000:1"))
+        + f" {_MACHINE}",
+        gpu=5,
+    ),
     # After the installation of the third-party engines: see `speed/arena.py`.
     "arena": recipe(f"rps sweeps/speed/arena.py --peers peers {_MACHINE}", gpu=5),
     "derivatives": recipe(f"rps sweeps/speed/derivatives.py {_MACHINE}", cores=2),

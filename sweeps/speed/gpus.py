@@ -1,38 +1,42 @@
 """Duration of whole sweeps on several GPUs of one host, and the timeline of their slots.
 
-Every sweep runs in a new process that sees some of the GPUs. First all sweeps fill their caches
-together. `JAX_PLATFORMS=cpu` makes the timing process leave the GPUs to them.
+Every sweep runs in a new process that sees some of the GPUs, with the code of this checkout or of
+another one. First all sweeps fill their caches together. `JAX_PLATFORMS=cpu` makes the timing
+process leave the GPUs to them.
 
     JAX_PLATFORMS=cpu rps sweeps/speed/gpus.py --machine "eight NVIDIA H100"
+    JAX_PLATFORMS=cpu rps sweeps/speed/gpus.py --sweeps 1000:1 1000:1:checkouts/0.4.0
 """
 
 from __future__ import annotations
 
 import json
+import os
+import re
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from rps_jax import InputError
+from rps_jax import InputError, __version__, errors
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.questions import Picture, Run, call_of, option
+from rps_jax.questions import Picture, Run, call_of
 from rps_jax.worlds import parse_domain
 from sweeps.speed.commands import TIMING, printed
-from sweeps.study_base import Parts, SpeedStudy, Table, records, run_process, text_table
+from sweeps.study_base import Parts, SpeedStudy, Table, part_name, records, text_table
 
 _LIMIT = 600.0  # [s] of a sweep
 _MAX_SEGMENTS = 10_000  # of a sweep
 _COLUMNS = {
     "worlds": "{worlds:,}",
     "GPUs": "{gpus}",
+    "version": "{version}",
     "whole command": "{whole:.1f} s",
     "one GPU over it": "{gain:.2f}",
     "of it compile": "{compile:.1f} s",
@@ -46,7 +50,7 @@ _TRACED = (
     "noted = []\n"
     "rps_jax.sweep({!r}, 'wide', worlds={}, report_to=lambda x: noted.append(x.segment))\n"
     "rows = [[*x[:3], *(x.live.get(i, 0) for i in range({}))] for x in noted if x is not None]\n"
-    "print(json.dumps(rows))\n"
+    "print(json.dumps(rows, default=int))\n"
 )
 _OBJECTS = [words(name) for name in parse_domain("wide").objects]
 
@@ -56,38 +60,36 @@ class Gpus(SpeedStudy[xr.Dataset]):
     """Time whole sweeps of `wide` on some GPUs of this host, with a filled cache.
 
     The results hold, by sweep, its duration, the times that it prints and, of the fewest worlds on
-    the fewest and on the most GPUs, its `segments`: device, start, end and live trials by object.
+    the most GPUs and on the fewest, its `segments`: device, start, end and live trials by object.
     """
 
     TITLE = "Sweeps on several GPUs"
     DIMENSION = "sweep"
-    GROWS = ("worlds", "gpus")
+    GROWS = ("sweeps",)
 
     law: str = "rps_tuned"
     """Law to run."""
-    worlds: tuple[int, ...] = option((262_144, 1_048_576), 1, 100_000_000)
-    """Numbers of worlds."""
-    gpus: tuple[int, ...] = option((1, 2, 4, 8), 1, 64)
-    """Numbers of GPUs; those that this host lacks are skipped."""
+    sweeps: tuple[str, ...] = ("262144:1", "262144:2", "1048576:1", "1048576:2")
+    """Sweeps in their order, each with its numbers of worlds and GPUs, as 262144:2, and optionally
+    the folder of another checkout, whose name is its version. The GPUs must be of this host."""
 
-    @cached_property
-    def sweeps(self) -> Sequence[tuple[int, int]]:
-        """Numbers of worlds and GPUs of all sweeps."""
-        listed = run_process(["nvidia-smi", "-L"], "gpus are not available")
-        return list(product(self.worlds, filter(listed.count("GPU ").__ge__, self.gpus)))
+    def check(self) -> None:
+        """Check the form of the sweeps."""
+        for text in self.sweeps:
+            if not re.fullmatch(r"\d+:[1-9]\d?(:.+)?", text):
+                raise errors.not_allowed("sweeps", text, "write WORLDS:GPUS or WORLDS:GPUS:FOLDER")
 
     def parts(self, run: Run) -> Parts:
         """Return the function that times each sweep."""
-        return {
-            f"{x} worlds, {gpus} GPUs": partial(self._timed, x, gpus) for x, gpus in self.sweeps
-        }
+        return {text: partial(self._timed, text) for text in self.sweeps}
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the durations, with the timeline of the traced sweeps."""
         rows, traces = [*records(results, "sweep")], {}
         for i, row in enumerate(rows):
-            first = next(x for x in rows if x["worlds"] == row["worlds"])
-            row |= {"gain": first["whole"] / row["whole"], "idle": np.nan}
+            same = (x for x in rows if all(x[k] == row[k] for k in ("worlds", "version")))
+            single = next((x["whole"] for x in same if x["gpus"] == 1), np.nan)
+            row |= {"gain": single / row["whole"], "idle": np.nan}
             segments = results.segments[i].dropna("segment").values
             if len(segments):
                 run = segments[:, 2].max() * row["gpus"]
@@ -102,31 +104,36 @@ class Gpus(SpeedStudy[xr.Dataset]):
         folder = tempfile.TemporaryDirectory()
         fill = partial(self._swept, folder.name, options=" --horizon 0.02")
         with ThreadPoolExecutor(len(self.sweeps)) as pool:
-            list(pool.map(fill, *zip(*self.sweeps, strict=True)))
+            list(pool.map(fill, self.sweeps))
         return folder
 
-    def _swept(self, folder: str, worlds: int, gpus: int, options: str = "") -> str:
+    def _swept(self, folder: str, sweep: str, options: str = "") -> str:
         """Return the output of a sweep with its cache in a folder."""
-        cache = Path(folder, f"{worlds}_{gpus}")
-        cache.mkdir(exist_ok=True)
+        worlds = _split(sweep)[0]
         command = f"sweep --laws {self.law} --domain wide --worlds {worlds}{options}"
-        command += f" --out {tempfile.mkdtemp(dir=cache)}/run"
-        return printed(["-m", "rps_jax", *command.split()], command, str(cache), _LIMIT, gpus)[0]
+        command += f" --out {tempfile.mkdtemp(dir=folder)}/run"
+        return _printed(folder, sweep, ["-m", "rps_jax", *command.split()], command)
 
-    def _timed(self, worlds: int, gpus: int) -> xr.Dataset:
+    def _is_traced(self, worlds: int, gpus: int) -> bool:
+        """Whether a sweep of this checkout has the fewest worlds of those on the most GPUs."""
+        own = [(n, x) for x, n, folder in map(_split, self.sweeps) if not folder]
+        fewest, most = min(own)[0], max(own)[0]
+        return gpus in (fewest, most) and worlds == min(x for n, x in own if n == most)
+
+    def _timed(self, sweep: str) -> xr.Dataset:
         """Return the times and the segments of a sweep."""
-        folder, rows, counts = self._caches.name, [], [n for _, n in self.sweeps]
+        folder, rows, (worlds, gpus, other) = self._caches.name, [], _split(sweep)
         start = time.perf_counter()
-        output = self._swept(folder, worlds, gpus)
+        output = self._swept(folder, sweep)
         whole = time.perf_counter() - start
         if (match := TIMING.search(output)) is None:
             raise InputError(f"the sweep of {worlds} worlds printed no time of its run.")
-        if worlds == min(self.worlds) and gpus in (min(counts), max(counts)):
+        if not other and self._is_traced(worlds, gpus):
             call = _TRACED.format(self.law, worlds, len(_OBJECTS))
-            output, _ = printed(["-c", call], call, f"{folder}/{worlds}_{gpus}", _LIMIT, gpus)
-            rows = json.loads(output.splitlines()[-1])
+            rows = json.loads(_printed(folder, sweep, ["-c", call], call).splitlines()[-1])
         values = dict(zip(("compile", "run", "rate"), map(float, match.groups()), strict=True))
-        sizes = {"worlds": worlds, "gpus": gpus, "whole": whole}
+        version = Path(other).name if other else __version__
+        sizes = {"worlds": worlds, "gpus": gpus, "version": version, "whole": whole}
         segments = np.full((_MAX_SEGMENTS, 3 + len(_OBJECTS)), np.nan)
         if rows:
             segments[: len(rows)] = rows
@@ -134,6 +141,22 @@ class Gpus(SpeedStudy[xr.Dataset]):
 
 
 gpus = call_of(Gpus)
+
+
+def _split(sweep: str) -> tuple[int, int, str]:
+    """Return numbers of worlds and GPUs, and the folder of another checkout or ""."""
+    worlds, count, *folder = sweep.split(":", 2)
+    return int(worlds), int(count), "".join(folder)
+
+
+def _printed(folder: str, sweep: str, words: Sequence[str], label: str) -> str:
+    """Return what Python prints with GPUs, code and cache of a sweep."""
+    cache = Path(folder, part_name(sweep))
+    cache.mkdir(exist_ok=True)
+    _, count, other = _split(sweep)
+    path = os.pathsep.join([other, os.environ.get("PYTHONPATH", "")])
+    environment = {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"} if other else None
+    return printed(words, label, str(cache), _LIMIT, count, environment)[0]
 
 
 def busy_time(segments: np.ndarray) -> float:

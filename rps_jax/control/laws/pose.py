@@ -44,6 +44,9 @@ the half width w on its corners follows up to the curvature w / (w^2 + depth^2),
       theta - K_h c_G within h_max:  omega = v clip(K_e (heading - yaw), +-kappa),
       v_y = -omega (r + the distance of the front)
 
+A goal with a relative heading has no grid before a face is flush. Until then the law pushes
+straight ahead; then theta is the heading of the base plus the turn, and the law starts anew.
+
 Without contact v_free and omega_free are the bounds; the base nears the box at its distance times
 1 / s. A base that cannot move sideways steers in Q6: omega towards the leg + K_h c, within h_max;
 in Q8 it drives forwards or in reverse. The law needs a flat front. In its smooth form the contact
@@ -51,7 +54,7 @@ is a weight that mixes the twists of Q6; modes and legs switch.
 """
 
 from functools import partial
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -78,12 +81,20 @@ PUSH, BACK, AROUND = 0, 1, 2  # modes
 _EDGE = 0.05  # [m] of contact beyond a known end, which contradicts it
 _SAME = 0.03  # [m] by which a face or an end may have moved between two contacts
 _FLUSH, _UNEVEN = 0.4, -1.0  # [s] of even contact, and of uneven contact
+_DRUM = 40.0  # [s] of a push, after which an object has no face
 _HALF = 0.07, 0.5  # [m] half widths of objects
 _CARROT, _AHEAD = 0.5, 1.0  # [rad] of the aim on the circle: omnidirectional or not
 _PAST = 0.35  # [m] of the front beyond the face, at which an approach has failed
 _HALF_FRONT = 0.29  # [m]
 _AROUND, _CENTRAL = 0.08, 0.2  # [m] behind the front, and from its middle
 _TURNS = 0.8  # [rad] between base and leg, up to which it feels the box and turns while it touches
+
+
+def _tuned(
+    unit: str, about: str, low: float, high: float, log: bool = False, **limits: Any
+) -> Spec:
+    """Declare a parameter that is not negative, and the interval in which it is tuned."""
+    return Spec(unit, about, tune=Bound(low, high, log), **(limits or {"ge": 0}))
 
 
 @document
@@ -96,81 +107,59 @@ class PoseParams(NamedTuple):
     v_approach: ApproachSpeed = 0.03
     v_free: Annotated[Parameter, Spec("m/s", "bound on the speed without contact", gt=0)] = 0.05
     omega_free: Annotated[Parameter, Spec("rad/s", "bound on |omega| without contact", gt=0)] = 0.15
-    r: Annotated[
-        Parameter, Spec("m", "half width of an unknown object", gt=0, tune=Bound(0.1, 0.4))
-    ] = 0.2346
-    s_min: Annotated[
-        Parameter, Spec("m", "least way of the last leg, Q4", ge=0, tune=Bound(0.1, 2))
-    ] = 1.381
-    s_flush: Annotated[
-        Parameter, Spec("m", "the same, once the box was flush, Q4", ge=0, tune=Bound(0.02, 2))
-    ] = 1.187
-    s_back: Annotated[Parameter, Spec("m", "more way, Q5", ge=0, tune=Bound(0, 0.5))] = 0.08447
-    y_tol: Annotated[Parameter, Spec("m", "error of a last leg, Q4", ge=0, tune=Bound(0, 0.1))] = (
-        0.01493
+    r: Annotated[Parameter, _tuned("m", "half width of an unknown object", 0.1, 0.4, gt=0)] = 0.2346
+    s_min: Annotated[Parameter, _tuned("m", "least way of the last leg, Q4", 0.1, 2)] = 1.381
+    s_flush: Annotated[Parameter, _tuned("m", "the same, once the box was flush, Q4", 0.02, 2)] = (
+        1.187
     )
-    cap: Annotated[
-        Parameter, Spec("1", "error that the last leg corrects, Q4", ge=0, tune=Bound(0, 0.5))
-    ] = 0.05
-    y_miss: Annotated[
-        Parameter, Spec("m", "error of a last leg that is repeated", ge=0, tune=Bound(0, 0.1))
-    ] = 0.025
+    s_back: Annotated[Parameter, _tuned("m", "more way, Q5", 0, 0.5)] = 0.08447
+    y_tol: Annotated[Parameter, _tuned("m", "error of a last leg, Q4", 0, 0.1)] = 0.01493
+    cap: Annotated[Parameter, _tuned("1", "error that the last leg corrects, Q4", 0, 0.5)] = 0.05
+    y_miss: Annotated[Parameter, _tuned("m", "error of a last leg that is repeated", 0, 0.1)] = (
+        0.025
+    )
     stop: Annotated[Parameter, Spec("m", "way left at the end, Q5", ge=-0.1)] = 0.004
     tries: Annotated[Parameter, Spec("1", "number of repetitions", ge=0)] = 3.0
-    slope: Annotated[
-        Parameter, Spec("1", "sideways over forward speed, Q6", ge=0, tune=Bound(0.02, 0.6))
-    ] = 0.2135
+    slope: Annotated[Parameter, _tuned("1", "sideways over forward speed, Q6", 0.02, 0.6)] = 0.2135
     K_y: Annotated[
         Parameter,
-        Spec("1/s", "gain of the sideways speed, Q6", ge=0, tune=Bound(0.02, 2, log=True)),
+        _tuned("1/s", "gain of the sideways speed, Q6", 0.02, 2, True),
     ] = 0.2
     K_h: Annotated[
         Parameter,
-        Spec("rad/m", "gain of the heading, Q6 and Q10", ge=0, tune=Bound(0.1, 6, log=True)),
+        _tuned("rad/m", "gain of the heading, Q6 and Q10", 0.1, 6, True),
     ] = 1.798
-    h_max: Annotated[
-        Parameter, Spec("rad", "bound of this heading", ge=0, tune=Bound(0.01, 0.8))
-    ] = 0.7169
-    turn: Annotated[
-        Parameter, Spec("1", "share of the sharpest turn, Q10", ge=0, tune=Bound(0.3, 1.2))
-    ] = 0.5994
+    h_max: Annotated[Parameter, _tuned("rad", "bound of this heading", 0.01, 0.8)] = 0.7169
+    turn: Annotated[Parameter, _tuned("1", "share of the sharpest turn, Q10", 0.3, 1.2)] = 0.5994
     reach: Annotated[
         Parameter,
-        Spec("1", "share of a turn that the last leg may use, Q4", ge=0, tune=Bound(0, 1.5)),
+        _tuned("1", "share of a turn that the last leg may use, Q4", 0, 1.5),
     ] = 0.7677
-    s_line: Annotated[
-        Parameter, Spec("m", "straight end of the last leg, Q4", ge=0, tune=Bound(0, 0.8))
-    ] = 0.3371
+    s_line: Annotated[Parameter, _tuned("m", "straight end of the last leg, Q4", 0, 0.8)] = 0.3371
     K_e: Annotated[
         Parameter,
-        Spec(
-            "1/m", "curvature for an error of the heading, Q10", ge=0, tune=Bound(1, 20, log=True)
-        ),
+        _tuned("1/m", "curvature for an error of the heading, Q10", 1, 20, True),
     ] = 9.391
     omega_push: Annotated[
         Parameter,
-        Spec("rad/s", "bound on |omega| in contact", gt=0, tune=Bound(0.005, 0.15, log=True)),
+        _tuned("rad/s", "bound on |omega| in contact", 0.005, 0.15, True, gt=0),
     ] = 0.03
-    l_edge: Annotated[
-        Parameter, Spec("m", "offset of a bad contact, Q7", ge=0, tune=Bound(0.05, 0.3))
-    ] = 0.1418
-    l_turn: Annotated[
-        Parameter, Spec("m", "the same, of an uneven contact, Q7", ge=0, tune=Bound(0.1, 0.3))
-    ] = 0.2511
-    back: Annotated[Parameter, Spec("m", "retreat, Q7", ge=0, tune=Bound(0.02, 0.6))] = 0.09401
+    l_edge: Annotated[Parameter, _tuned("m", "offset of a bad contact, Q7", 0.05, 0.3)] = 0.1418
+    l_turn: Annotated[Parameter, _tuned("m", "the same, of an uneven contact, Q7", 0.1, 0.3)] = (
+        0.2511
+    )
+    back: Annotated[Parameter, _tuned("m", "retreat, Q7", 0.02, 0.6)] = 0.09401
     R: Annotated[
-        Parameter, Spec("m", "radius of the circle beyond the box, Q8", gt=0, tune=Bound(0.4, 1))
+        Parameter, _tuned("m", "radius of the circle beyond the box, Q8", 0.4, 1, gt=0)
     ] = 0.5324
-    gap: Annotated[
-        Parameter, Spec("m", "gap at the staging point, Q8", gt=0, tune=Bound(0.03, 0.6))
-    ] = 0.05946
+    gap: Annotated[Parameter, _tuned("m", "gap at the staging point, Q8", 0.03, 0.6, gt=0)] = (
+        0.05946
+    )
     beyond: Annotated[
-        Parameter, Spec("m", "of the base beyond the felt end, Q9", ge=-0.2, tune=Bound(-0.1, 0.2))
+        Parameter, _tuned("m", "of the base beyond the felt end, Q9", -0.1, 0.2, ge=-0.2)
     ] = 0.02732
     looks: Annotated[Parameter, Spec("1", "number of looks in a leg, Q9", ge=0)] = 3.0
-    tau: Annotated[
-        Parameter, Spec("s", "time constant of the filter of the pose", ge=0, tune=Bound(0, 2))
-    ] = 0.5
+    tau: Annotated[Parameter, _tuned("s", "time constant of the filter of the pose", 0, 2)] = 0.5
     t_end: Annotated[Parameter, Spec("s", "time at which the law gives up", gt=0)] = 290.0
 
 
@@ -196,6 +185,8 @@ class PoseState(NamedTuple):
     looking: Annotated[jax.Array, Spec("1", "whether the base looks for an end")]
     looks: Annotated[jax.Array, Spec("1", "number of looks in this leg")]
     tries: Annotated[jax.Array, Spec("1", "number of repetitions")]
+    goal: Annotated[jax.Array, Spec("m, m, rad", "pose of the goal in the world")]  # (3,)
+    oriented: Annotated[jax.Array, Spec("1", "whether a goal's relative heading is known")]
     side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around the object; -1: clockwise")]
     gear: Annotated[jax.Array, Spec("1", "1: forwards around the object; -1: in reverse")]
     done: Annotated[jax.Array, Spec("1", "whether the law is done")]
@@ -225,8 +216,9 @@ def init(params: PoseParams, temperatures: Smooth | None = None) -> PoseState:
         known=sides > 0,
         centred=point > 0,
         twist=sides[:3],
+        goal=sides[:3],
         **dict.fromkeys(names, point),
-        **dict.fromkeys(("touched", "looking", "done"), no),
+        **dict.fromkeys(("touched", "looking", "done", "oriented"), no),
         **dict.fromkeys(("side", "gear"), zero + 1),
     )
 
@@ -315,7 +307,12 @@ def step(
     axle = jnp.asarray(0.0 if touch.axle is None else touch.axle)
     half_length = obs.front
     base, yaw, goal = *filtered_pose(params, state, touch), touch.p_world_target
-    theta, weight = jnp.asarray(touch.yaw_target), jnp.asarray(touch.in_contact)
+    theta = yaw_target = jnp.asarray(touch.yaw_target)
+    weight = jnp.asarray(touch.in_contact)
+    leg, oriented, is_relative = state.leg, state.oriented, touch.relative is not None
+    if is_relative:  # a leg straight ahead until a face is flush
+        theta = jnp.where(oriented | state.touched, state.goal[2], planar.wrap(yaw - jnp.pi))
+        leg = jnp.where(oriented, leg, 2)
     touches = weight if weight.dtype == bool else weight > 0.5
     u = planar.unit(yaw)
     grid = planar.unit(theta + jnp.arange(4) * (jnp.pi / 2))  # (4, 2) d_j
@@ -329,7 +326,7 @@ def step(
     p_world_contact = base + planar.rotate(yaw, contact)
     first, touched = touches & ~state.touched, state.touched | touches
     time, t_lost = state.time + touch.period, jnp.where(touches, 0.0, state.t_lost + touch.period)
-    psi = theta + state.leg * (jnp.pi / 2)
+    psi = theta + leg * (jnp.pi / 2)
     pushing = state.mode == PUSH
     is_facing = jnp.abs(planar.wrap(psi - yaw)) < _TURNS
     feels = pushing & touches & on_front & is_facing & state.touched
@@ -340,12 +337,12 @@ def step(
     h = state.h + jnp.where(
         feels & (state.t_lost < 0.1), grid @ (p_world_front - state.p_world_front), 0.0
     )
-    leg, fronts, bases = state.leg, grid @ (p_world_front - goal), grid @ (base - goal)
+    fronts, bases = grid @ (p_world_front - goal), grid @ (base - goal)
     along, across = _turned(fronts, leg)[:2]
     box = Box(h, state.known, state.centred)
     felt = feel(params, box.turned(leg), along, across, obs, t_even).turned(-leg % 4)
     middle = p_world_contact + params.r * planar.unit(yaw + normal)
-    forgets = first | (feels & (t_even <= _UNEVEN))
+    forgets = (first & ~jnp.any(state.known)) | (feels & (t_even <= _UNEVEN))
     square = Box(grid @ (middle - goal) + params.r, jnp.zeros(4, bool), jnp.zeros(2, bool))
     h, known, centred = soft.tree_where(forgets, square, soft.tree_where(feels, felt, box))
 
@@ -375,7 +372,7 @@ def step(
     settled = (state.t_push > 2) & has_looked & ((t_even > 1) | (state.t_push > 6))
     room = room_of(way_left)
     is_off = last_leg & feels & settled & may_try
-    is_off = is_off & (jnp.abs(y) > room + 0.01) & (way_left > s_min - 0.1)
+    is_off &= (jnp.abs(y) > room + 0.01) & (way_left > s_min - 0.1)
     at_end = last_leg & feels & (way_left < params.stop)
     # A drum is never flush: a long push and a repetition are enough.
     is_uneven = (t_even < 0.3) & ((state.tries < 1) | (state.t_push < 20))
@@ -385,6 +382,8 @@ def step(
     repeats = is_off | misses
     done = state.done | (at_end & ~misses) | (time > params.t_end)
     chooses = first | is_back | is_beside | repeats
+    if is_relative:
+        chooses &= oriented
     room = room_of(way)
     sideways = jnp.where((jnp.abs(y) > room) & ~is_beside, jnp.where(y > 0, 3, 1), 0)
     leg_next = jnp.where((way < s_min) & ~is_off & ~is_beside, 2, sideways)
@@ -400,7 +399,7 @@ def step(
     along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
     middle_across, middle_along = (box_left - box_right) / 2, (ahead - behind) / 2
     wants = (leg % 2 == 0) & feels & ~chooses & (t_even > 0.6) & ~has_looked
-    wants = wants & (~last_leg | (way_left > 0.03)) & (state.t_push > 0.6)
+    wants &= (~last_leg | (way_left > 0.03)) & (state.t_push > 0.6)
     knows_left = _turned(known, leg)[1]
     target = jnp.where(knows_left, -box_right - params.beyond, box_left + params.beyond)
     look = jnp.where(wants, target, state.look)
@@ -421,7 +420,7 @@ def step(
     known, looking = known & ~failed, looking & ~failed
     patience = jnp.where(looks > 0, 0.1, 0.4)
     leaves = (touches & is_bad & (t_push > patience)) | is_lost | failed | turns | wants
-    leaves = pushing & touched & leaves
+    leaves &= pushing & touched
     hits = (state.mode == AROUND) & touches
     lands = hits & on_front & ~is_bad & is_facing & ~turns
     stops = hits & ~lands & (on_front | omni)
@@ -489,11 +488,7 @@ def step(
     turn_left = planar.wrap(psi + steer - yaw)
     arm = half_length + params.r
     curve = jnp.clip(params.K_e * turn_left, -kappa, kappa)
-    v = jnp.where(
-        follows,
-        jnp.minimum(v, params.v_max / jnp.hypot(1.0, curve * arm)),
-        v,
-    )
+    v = jnp.minimum(v, jnp.where(follows, params.v_max / jnp.hypot(1.0, curve * arm), v))
     bound = soft.where(weight, params.omega_push, params.omega_max)
     omega = jnp.where(
         follows, curve * v, jnp.where(touched, jnp.clip(turn_left, -bound, bound), 0.0)
@@ -502,7 +497,7 @@ def step(
     gain = soft.where(weight, params.K_y, 0.5)
     may_slide = omni & touched & (touches | (t_push == 0))
     v_y = jnp.where(may_slide, jnp.clip(gain * lateral, -bound, bound), 0.0)
-    v_y = v_y - jnp.where(follows, omega * arm, 0.0)
+    v_y -= jnp.where(follows, omega * arm, 0.0)
     # Q7 and Q8.
     flee = jnp.array([-1.0, 0.0]) * params.v_free
     if omni:
@@ -522,6 +517,10 @@ def step(
     v, v_y, omega = (jnp.where(done, 0.0, x) for x in twist)
     v_y = v_y if omni else v_y + axle * omega
     twist = Twist(v, v_y, omega).saturate(v_max, omega_max)
+    if is_relative:
+        orients = feels & ~oriented & ((t_even > _FLUSH) | (state.t_push > _DRUM))
+        theta = jnp.where(orients, planar.wrap(yaw + yaw_target), theta)
+        oriented, touched, known = oriented | orients, touched & ~orients, known & ~orients
     distance = planar.norm(jnp.stack([way_left, y]))
     details = Details(offset, distance, jnp.zeros_like(distance), face, mode != PUSH)
     memory = PoseState(
@@ -544,6 +543,8 @@ def step(
         looking,
         looks,
         tries,
+        jnp.stack([*goal, theta]),
+        oriented,
         side,
         gear,
         done,
@@ -556,12 +557,12 @@ def is_done(state: PoseState) -> Array:
     return state.done
 
 
-def memory(state: PoseState, goal: np.ndarray) -> Memory:
+def memory(state: PoseState) -> Memory:
     """Return the mode and the middle of the box."""
     mode = ("", *MODES[:2])[int(state.mode)]
     ahead, left, behind, right = state.h
-    middle = np.array([ahead - behind, left - right]) / 2
-    middle = goal[:2] + solid.rotate(goal[2:], middle[None])[0]
+    goal, middle = np.asarray(state.goal), np.array([ahead - behind, left - right]) / 2
+    middle = goal[:2] + solid.rotate(goal[2], middle)
     return Memory(mode, middle) if state.touched else Memory(mode)
 
 
@@ -579,22 +580,25 @@ LAW = Law(
     observe_sent=observe_sent,
     memory=memory,
 )
+_DRIVE = PoseParams(
+    r=0.22,
+    s_min=0.8,
+    s_flush=0.6,
+    s_back=0.15,
+    y_tol=0.02,
+    cap=0.12,
+    K_h=2.0,
+    h_max=0.25,
+    l_edge=0.25,
+    back=0.3,
+    R=0.7,
+    gap=0.3,
+    beyond=0.05,
+    looks=1.0,
+)
 PRESETS = {
     "pose": PoseParams(),
-    "pose_drive": PoseParams(  # for bases that cannot move sideways
-        r=0.22,
-        s_min=0.8,
-        s_flush=0.6,
-        s_back=0.15,
-        y_tol=0.02,
-        cap=0.12,
-        K_h=2.0,
-        h_max=0.25,
-        l_edge=0.25,
-        back=0.3,
-        R=0.7,
-        gap=0.3,
-        beyond=0.05,
-        looks=1.0,
-    ),
+    "pose_drive": _DRIVE,  # for bases that cannot move sideways
+    # The same with a narrow front, as 0.3 m of `turtlebot4`.
+    "pose_narrow": _DRIVE._replace(l_edge=0.13, l_turn=0.14, gap=0.15, beyond=0.03),
 }

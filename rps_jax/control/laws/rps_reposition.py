@@ -18,7 +18,6 @@ from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from rps_jax import spec
 from rps_jax.control import soft
@@ -138,9 +137,8 @@ def step(
     return memory, twist, details
 
 
-def memory(state: RPSRepositionState, goal: np.ndarray) -> Memory:
+def memory(state: RPSRepositionState) -> Memory:
     """Return whether the base repositions, and the middle M of the object."""
-    del goal
     mode = "repositioning" * bool(state.away)
     return Memory(mode, state.p_world_object) if state.law.law.touched else Memory(mode)
 

@@ -48,7 +48,6 @@ from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from rps_jax import spec
 from rps_jax.control import soft
@@ -350,9 +349,8 @@ def step(
     return memory, Twist(v, axle * omega, omega), details
 
 
-def memory(state: UnicycleState, goal: np.ndarray) -> Memory:
+def memory(state: UnicycleState) -> Memory:
     """Return the mode and the middle M of the object."""
-    del goal
     weights = state.retreat, state.around, state.align
     modes = zip(weights, MODES, strict=True)
     mode = next((words for weight, words in modes if weight > 0.5), "")

@@ -45,6 +45,7 @@ class Aim(NamedTuple):
     at_end: Bool[Array, ""] | bool = True  # whether the trial may succeed now
     failed: Bool[Array, ""] | bool = False
     yaw_target: Scalar | None = None  # [rad] heading of the goal; None: it has none
+    relative: Scalar | None = None  # as `Observation.relative`
     # The task's own verdict; None: the contact point is within `d_success` of the target.
     success: Bool[Array, ""] | None = None
 

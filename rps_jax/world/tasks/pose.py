@@ -6,6 +6,9 @@ than the base is sideways. The pushed face is the face nearest to the last conta
 has no face: its place is the point of its rim that faces the base, its heading the direction of its
 last 0.3 m of way.
 
+With `turn` the goal's heading is relative to the face that is first felt flush: it is the heading
+of the base at that moment plus the turn. A cylinder counts as flush at its first touch.
+
 A law that declares that it is done (`Law.is_done`) is judged then and only then, so that the
 simulation does not stop it at a lucky moment. Another law is judged in each control step.
 """
@@ -13,7 +16,7 @@ simulation does not stop it at a lucky moment. Another law is judged in each con
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -27,7 +30,7 @@ from rps_jax.geometry.arrays import Array, Float, Floats
 from rps_jax.record.files import Arrays
 from rps_jax.robot.shell import Shell
 from rps_jax.spec import Spec
-from rps_jax.world.quantity import Quantity, Range
+from rps_jax.world.quantity import Quantity, Range, check_unused
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
 
 _SPACING = 0.15  # [m] of way between the stored positions of a cylinder; the heading spans two
@@ -43,6 +46,7 @@ class PoseProgress(NamedTuple):
     way: Float[Array, "*B 3 2"]  # [m] earlier positions of a cylinder, the latest first
     errors: Float[Array, "*B 3"]  # [m, m, rad] as `outcomes`; NaN before the first touch
     declared: Floats  # [1] whether the law has declared that it is done
+    first: Floats | None = None  # [rad] heading of the face first felt flush; NaN before
 
     def outcomes(self) -> dict[str, Array]:
         """Return the errors of the pushed face, and whether the law ended the trial."""
@@ -58,28 +62,38 @@ class PoseCourse(NamedTuple):
     heading: Floats  # [rad]
     d_success: Floats  # [m]
     yaw_success: Floats  # [rad]
+    relative: Floats | None = None  # [1] 1: `heading` is relative to the face first felt flush
 
     def start(self) -> PoseProgress:
         """Return the progress before the first touch."""
         zero = jnp.zeros_like(self.heading)
         way, errors = jnp.full((3, 2), jnp.inf, zero.dtype), jnp.full(3, jnp.nan, zero.dtype)
-        return PoseProgress(jnp.zeros(4, zero.dtype), way, errors, zero)
+        first = None if self.relative is None else errors[0]
+        return PoseProgress(jnp.zeros(4, zero.dtype), way, errors, zero, first)
 
     def step(self, progress: PoseProgress, positions: Positions) -> tuple[PoseProgress, Aim]:
         """Judge the pushed face against the goal."""
         goal, footprint = positions.p_world_goal, positions.footprint
         middle, yaw, touches = positions.p_world_object, positions.object_yaw, positions.touches
-        if footprint.vertices.shape[0] < 3:
-            way = _extended(progress.way, middle)
-            place = middle - footprint.radius * planar.unit(self.heading)
-            face, direction = progress.face, planar.direction(middle - way[2])
+        face, way, first = progress.face, progress.way, progress.first
+        heading, is_round = self.heading, footprint.vertices.shape[0] < 3
+        if is_round:
+            way = _extended(way, middle)
+            direction = planar.direction(middle - way[2])
         else:
             contact = planar.rotate(-yaw, positions.p_world_contact - middle)
             pushed = _pushed_face(footprint, contact, positions.base[2] - yaw)
-            way, face = progress.way, jnp.where(touches, pushed, progress.face)
-            place, direction = middle + planar.rotate(yaw, face[:2]), yaw + face[2]
-        away = planar.rotate(-self.heading, place - goal)
-        turn = planar.wrap(direction - self.heading)
+            face = jnp.where(touches, pushed, face)
+            direction = yaw + face[2]
+        if first is not None:
+            tilt = jnp.abs(planar.wrap(direction - positions.base[2]))
+            is_flush = touches & (is_round | (tilt < self.yaw_success))
+            first = jnp.where(jnp.isnan(first) & is_flush, positions.base[2], first)
+            heading = first + heading
+        rim = -footprint.radius * planar.unit(heading)
+        place = middle + (rim if is_round else planar.rotate(yaw, face[:2]))
+        away = planar.rotate(-heading, place - goal)
+        turn = planar.wrap(direction - heading)
         values = jnp.stack([planar.norm(away), jnp.abs(away[1]), jnp.abs(turn)])
         touched = touches | ~jnp.isnan(progress.errors[0])
         values = jnp.where(touched, values, jnp.nan)
@@ -87,8 +101,8 @@ class PoseCourse(NamedTuple):
         is_there = touched & (values[0] < self.d_success) & (values[2] < self.yaw_success)
         success = is_there if declared is None else is_there & declared
         ended = progress.declared if declared is None else declared.astype(values.dtype)
-        aim = Aim(goal, yaw_target=self.heading, success=success)
-        return PoseProgress(face, way, values, ended), aim
+        aim = Aim(goal, yaw_target=self.heading, relative=self.relative, success=success)
+        return PoseProgress(face, way, values, ended, first), aim
 
     def remaining(self, progress: PoseProgress, p_world_goal: Array, point: Array) -> Array:
         """Return the distance to the goal."""
@@ -145,6 +159,10 @@ class Pose(Task):
         Range,
         Quantity("rad", "heading of the last push", ge=-_TURN, le=_TURN, owner="course"),
     ] = Range(-math.pi, math.pi)
+    turn: Annotated[
+        float | None,
+        Spec("rad", "heading relative to the face that is first felt flush", ge=-_TURN, le=_TURN),
+    ] = None
     d_success: Annotated[float, Spec("m", "greatest error of the place", gt=0, le=1)] = 0.05
     yaw_success: Annotated[float, Spec("rad", "greatest error of the heading", gt=0, le=3.2)] = 0.1
 
@@ -154,6 +172,20 @@ class Pose(Task):
                 rule = "it is beyond 2 pi: give radians, as 1.571 for 90 degrees"
                 raise errors.not_allowed("task heading", f"{angle:g}", rule)
         super().__post_init__()
+
+    def check(self) -> None:
+        """Raise InputError for a heading beside a turn."""
+        check_unused(self, "task ", dict.fromkeys(self.idle, "its turn leaves"))
+
+    @property
+    def shape(self) -> Hashable:
+        """Name of the task, and whether the heading is relative."""
+        return self.kind, self.turn is None
+
+    @property
+    def idle(self) -> frozenset[str]:
+        """Names of the numbers that are not drawn."""
+        return frozenset(() if self.turn is None else ("heading",))
 
     def check_goal(
         self, target: Sequence[float], shell: Shell, object_width: Callable[[], float]
@@ -168,8 +200,10 @@ class Pose(Task):
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, PoseCourse]:
         """Return the goals."""
         heading = self.heading.at(inputs.u["heading"]) + inputs.bearing
-        tolerances = (np.full(heading.shape, x) for x in (self.d_success, self.yaw_success))
-        leaves: Any = (inputs.p_world_target, heading, *tolerances)
+        constants = self.d_success, self.yaw_success
+        if self.turn is not None:
+            heading, constants = np.full_like(heading, self.turn), (*constants, 1.0)
+        leaves: Any = (inputs.p_world_target, heading, *(0 * heading + x for x in constants))
         return inputs.p_world_target, PoseCourse(*leaves)
 
 
