@@ -24,7 +24,8 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from rps_jax import InputError, __version__, errors
+import rps_jax
+from rps_jax import InputError, errors
 from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.questions import Picture, Run, call_of
 from rps_jax.worlds import parse_domain
@@ -132,7 +133,7 @@ class Gpus(SpeedStudy[xr.Dataset]):
             call = _TRACED.format(self.law, worlds, len(_OBJECTS))
             rows = json.loads(_printed(folder, sweep, ["-c", call], call).splitlines()[-1])
         values = dict(zip(("compile", "run", "rate"), map(float, match.groups()), strict=True))
-        version = Path(other).name if other else __version__
+        version = Path(other).name if other else rps_jax.__version__
         sizes = {"worlds": worlds, "gpus": gpus, "version": version, "whole": whole}
         segments = np.full((_MAX_SEGMENTS, 3 + len(_OBJECTS)), np.nan)
         if rows:
