@@ -148,7 +148,7 @@ def spec_of(annotation: object) -> Spec | None:
     return dataclasses.replace(spec, **limits) if limits else spec
 
 
-def _texts_of(kind: type) -> Mapping[str, str]:
+def _texts_of(kind: type) -> Mapping[str, object]:
     if sys.version_info < (3, 14):
         return inspect.get_annotations(kind)
     import annotationlib  # pyright: ignore[reportMissingImports]

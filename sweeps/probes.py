@@ -52,7 +52,7 @@ PROBES = {
     "hardware": "hardware --quick --engine fused --horizon 20 --shifts 0.1",
     "wide": f"{_FAST} rps nps aps --domain wide --horizon 60",
     "hostile": f"sweep --worlds 24 --laws rps aps {_NETWORK} --domain hostile --horizon 60",
-    "learned": "sweep --worlds 24 --laws learned --domain hostile --horizon 60",
+    "learned": f"sweep --worlds 24 --laws learned --domain hostile {_SHORT}",
     "real": f"sweep --worlds 32 --laws rps_tuned force_push --domain real {_SHORT}",
     "prisms": f"sweep --worlds 32 --laws rps_tuned dipole --domain prisms {_SHORT}",
     "feet": f"{_FAST} --domain wide,feet=0.5:0.9 --horizon 60",

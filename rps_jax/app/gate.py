@@ -78,7 +78,7 @@ class Gate:
         silent = logging.Logger("rps view", logging.CRITICAL)  # of malformed requests
         return serve(*arguments, **options, logger=silent)
 
-    def refuses(self, headers: Mapping[str, str]) -> bool:
+    def refuses(self, headers: Any) -> bool:
         """Return whether a request has another host, or comes from another page."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not _is_this_machine(hosts[0]):

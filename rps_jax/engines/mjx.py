@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -197,7 +197,7 @@ class MJX(Engine):
 def put(model: mujoco.MjModel) -> mjx.Model:
     """Return a model on the device."""
     # MJX holds a static copy of the bounding radii for height fields, which would prevent stacking.
-    unused: dict[str, Any] = {"_impl.geom_rbound_hfield": np.zeros(model.ngeom)}
+    unused: Pytree = {"_impl.geom_rbound_hfield": np.zeros(model.ngeom)}
     return mjx.put_model(model).tree_replace(unused)  # pyright: ignore[reportReturnType]
 
 

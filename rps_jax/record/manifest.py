@@ -14,7 +14,6 @@ from typing import Any
 
 from rps_jax.record import options
 from rps_jax.record.files import JsonObject
-from rps_jax.record.options import Hint
 from rps_jax.spec import annotation_in
 
 
@@ -22,13 +21,13 @@ from rps_jax.spec import annotation_in
 class Stored:
     """Annotation of a type: how manifests and results store values of it."""
 
-    write: Callable[[str, Hint], Mapping[str, object]]
+    write: Callable[[str, Any], Mapping[str, object]]
     """Returns the entries, as JSON, of a field with this name and value."""
     read: Callable[[str, JsonObject, Path], Any] | None = None
     """Returns the value of a field with this name, from all entries and the run folder."""
     kinds: tuple[type, ...] = (object,)
     """Types of the values that `write` accepts; others are written without it."""
-    label: Callable[[object], str] | None = None
+    label: Callable[[Any], str] | None = None
     """Returns a value as the text of an attribute of results."""
 
 

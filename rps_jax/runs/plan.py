@@ -12,10 +12,10 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import numpy as np
@@ -46,7 +46,7 @@ _POINTS = Stored(
     lambda name, at: {} if at is None else {name: at.digest},
     lambda name, entries, folder: None,  # `load_plan` reads their file
 )
-ProgramKey = tuple[Any, ...]  # index of the object, class and shapes of the law's parameters
+ProgramKey = tuple[Hashable, ...]  # index of the object, class and shapes of the law's parameters
 
 
 @dataclass(frozen=True)

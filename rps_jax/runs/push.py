@@ -264,7 +264,7 @@ def bag_steps(trajectory: Trajectory, obs: PyTree, period: float) -> Iterator[St
 
 def case_options(
     options: TrialOptions, setting: Setting, kind: type[TrialOptions] = TrialOptions
-) -> JsonObject:
+) -> dict[str, Any]:
     """Return fields of options as arguments of `Case`; the skin follows the physics."""
     fields = {f.name: getattr(options, f.name) for f in dataclasses.fields(kind)}
     return fields | {"skin": options.skin or paper.SKIN[setting.physics.cone]}

@@ -118,7 +118,7 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
         obs, info = self._vector.reset(seed=seed)
         return obs[0], self._info(info)
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Infos]:
+    def step(self, action: object) -> tuple[np.ndarray, float, bool, bool, Infos]:
         """Execute an action (3,), or (2,) on a base that cannot move sideways."""
         *results, infos = self._vector.step([action])
         obs, reward, terminated, truncated = (values[0] for values in results)
@@ -271,7 +271,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._keys = keys if self._keys is None else jnp.where(known & where, keys, self._keys)
 
     @device.standard_jax()
-    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
+    def step(self, actions: object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Execute actions (num_envs, 3), or (num_envs, 2)."""
         device.check_process()
         mode = self.metadata["autoreset_mode"]

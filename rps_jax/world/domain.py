@@ -286,7 +286,7 @@ class Domain:
             return Range(QUANTITIES[name].low, QUANTITIES[name].high)
         return interval
 
-    def with_changes(self, changes: JsonObject) -> "Domain":
+    def with_changes(self, changes: Mapping[str, Any]) -> "Domain":
         """Return the domain with other fields, or ranges of registered quantities."""
         fields_ = {name: x for name, x in changes.items() if name not in REGISTERED}
         custom = dict(fields_.pop("custom", self.custom))
@@ -580,7 +580,7 @@ def from_json(values: JsonObject) -> Domain:
     return domain
 
 
-def _from_json(values: Mapping[str, object], base: Domain) -> JsonObject:
+def _from_json(values: Mapping[str, object], base: Domain) -> dict[str, Any]:
     """Return fields of a domain; a range without a scale has that of the `base` domain."""
     parsed = {}
     known = [f.name for f in fields(Domain)]

@@ -26,6 +26,7 @@ import numpy as np
 from rps_jax import errors
 
 if TYPE_CHECKING:
+    from mujoco import MjModel, MjvGeom, Renderer
     from numpy.typing import ArrayLike
 
     from rps_jax.world.scene import Scene
@@ -225,7 +226,7 @@ class SceneRenderer:
         c, s = x / length, y / length
         wall.mat = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
-    def _add_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Colour) -> Any:
+    def _add_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Colour) -> MjvGeom:
         """Add a geom to this image, which has at most 10,000."""
         view = self.renderer.scene
         geom = view.geoms[view.ngeom]
@@ -252,7 +253,7 @@ def open_renderers(
     The MuJoCo renderers are closed at the end, since open ones warn when Python exits.
     """
     with contextlib.ExitStack() as stack:
-        renderers: dict[int, Any] = {}
+        renderers: dict[int, Renderer] = {}
         scene_renderers = []
         for tile in tiles:
             model = tile.scene.model
@@ -294,7 +295,7 @@ def _import_mujoco() -> Any:
 
 
 @contextlib.contextmanager
-def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
+def _renderer(model: MjModel, size: tuple[int, int]) -> Iterator[Renderer]:
     mujoco = _import_mujoco()
     width, height = (_FINER * n for n in size)
     buffer, quality = model.vis.global_, model.vis.quality

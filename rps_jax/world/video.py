@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -158,7 +158,9 @@ def _labelled(renderer: SceneRenderer, shot: Shot) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[Any], None]]:
+def _encoder(
+    path: Path, size: tuple[int, int], fps: int
+) -> Iterator[Callable[[np.ndarray | bytes], None]]:
     """Yield a function that encodes RGB images; write `path` only if all succeed."""
     try:
         import imageio_ffmpeg

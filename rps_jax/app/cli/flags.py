@@ -228,7 +228,7 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     return StructConstructorSpec(info.type, tuple(specs))
 
 
-def _text_of(kind: type, name: str, markers: tuple[Any, ...]) -> str:
+def _text_of(kind: type, name: str, markers: tuple[object, ...]) -> str:
     """Return the help of a field: its docstring, and the names that its texts may begin with."""
     named = annotation_in(typing.get_type_hints(kind, include_extras=True)[name], Named)
     names = f" Names: {', '.join(named.names())}." if named and not named.closed else ""

@@ -30,10 +30,10 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import ApproachSpeed, Law, LawParams, OmegaMax, SuccessDistance, bounds_of
+from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SuccessDistance, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Parameter, Scalar
+from rps_jax.geometry.arrays import Parameter, Pytree, Scalar
 from rps_jax.spec import Bound, Spec, document
 
 # Parameters of both forms of Force Push.
@@ -119,7 +119,7 @@ class Path(NamedTuple):
         offset = jnp.sum((p_world_contact - p_world_start) * normal)
         return Path(p_world_start, theta_d, contact, self.touched | touching), filled, offset
 
-    def twist(self, params: LawParams, v_robot: jax.Array, yaw: Scalar) -> Twist:
+    def twist(self, params: Pytree, v_robot: jax.Array, yaw: Scalar) -> Twist:
         """Return the twist that moves the contact at `v_robot` (2,) [m/s] and faces along the path.
 
         Before the first contact the base moves straight ahead.
@@ -151,7 +151,7 @@ def init(params: ForcePushParams) -> ForcePushState:
 
 
 def steer(
-    params: LawParams,  # of either law
+    params: Pytree,  # of either law
     theta_p: jax.Array,  # () [rad] at the last step
     theta_f: jax.Array,  # () [rad] angle of the force from the path
     offset: jax.Array,  # () [m] of the contact, to the path's left

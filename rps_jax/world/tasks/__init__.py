@@ -67,7 +67,7 @@ _RANGE = "a number, or low and high as [0.3, 0.6]"
 _FORMS = {bool: "true or false", int: "a whole number", 2: "pairs of x, y [m]", 3: "x, y, yaw"}
 
 
-def _stored(name: str, task: Task) -> JsonObject:
+def _stored(name: str, task: Any) -> JsonObject:
     """Return the entries of a task; none for `reach`, as in the manifests of earlier versions."""
     parsed = parse_task("reach" if task is None else task)
     return {} if parsed == TASKS["reach"]() else {name: asdict(parsed)}
@@ -111,7 +111,7 @@ def parse_task(task: TaskLike) -> Task:
         raise errors.not_allowed("task", repr(task), rule)
     kind = TASKS[errors.check_name("task", str(task["kind"]), TASKS, "FILE.json")]
     known = {x.name: x for x in fields(kind)}
-    values: JsonObject = {}
+    values: dict[str, Any] = {}
     for name, value in task.items():
         errors.check_name(f"task quantity of {kind.kind}", name, (*known, *kind.MARKS))
         if name == "kind" or name not in known:

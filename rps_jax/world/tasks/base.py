@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -105,7 +105,7 @@ class Task:
     FAILURES: ClassVar[dict[str, str]] = {}
 
     @classmethod
-    def read(cls, file: JsonObject, values: JsonObject) -> JsonObject:
+    def read(cls, file: JsonObject, values: JsonObject) -> dict[str, Any]:
         """Return fields from those `MARKS` of a mapping that are no fields, and its `values`."""
         return {}
 

@@ -79,7 +79,7 @@ class Rooms(Following):
     object_radius: float = option(0.25, 0, 5, unit="m")
 
     @classmethod
-    def read(cls, file: JsonObject, values: JsonObject) -> JsonObject:
+    def read(cls, file: JsonObject, values: JsonObject) -> dict[str, Any]:
         """Return the walls of polygons, an outline and an image."""
         polygons: Any = file.get("polygons", ())
         polygons = polygons if np.iterable(polygons) else [polygons]
