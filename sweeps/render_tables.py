@@ -89,13 +89,7 @@ STALE: dict[str, str] = {
         ),
         "the value function of `rps learn` observes the room to walls",
     ),
-    **dict.fromkeys(
-        (
-            "fit_one_push",
-            "gradients_direction",
-        ),
-        "a sum in the solver got its former order back, with other last bits",
-    ),
+    "fit_one_push": "a sum in the solver got its former order back, with other last bits",
     **dict.fromkeys(
         (
             "force_push_paths",
