@@ -480,3 +480,14 @@ def test_the_law_asks_for_the_heading_where_the_goal_has_none():
     )
     assert trace.outcome.success
     assert registry.law_of(registry.LAWS["pose"]).heading
+
+
+@pytest.mark.parametrize(
+    ("robot", "law"), [("ideal", "pose"), ("turtlebot4", "pose_drive"), ("f1tenth", None)]
+)
+def test_a_push_to_a_goal_with_a_heading_chooses_the_law_by_the_drive(robot, law):
+    if law is None:
+        with pytest.raises(rps_jax.InputError, match="brings objects to a heading; name one"):
+            _ = Case(robot=robot, task="pose")
+    else:
+        assert Case(robot=robot, task="pose").named_law == law

@@ -32,7 +32,7 @@ from rps_jax.control.base import (
     named_leaves,
     thawing,
 )
-from rps_jax.control.laws import unicycle
+from rps_jax.control.laws import pose, unicycle
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
@@ -116,9 +116,17 @@ def law_of(params: LawParams | type) -> Law:
     return _LAWS_BY_CLASS[kind]
 
 
-def default_law(drive: DriveKind, law: str = "rps") -> str:
-    """Return the name of a law, or of one for bases with this drive that cannot follow it."""
-    return law if drive == "omni" else unicycle.PRESET_OF[drive]
+def default_law(drive: DriveKind, law: str = "rps", heading: bool = False) -> str:
+    """Return the name of a law, or of one for bases with this drive or goals with a `heading`.
+
+    Raises:
+      InputError: no law of the package brings objects to a heading with this drive.
+    """
+    if heading and drive not in pose.PRESET_OF:
+        rule = f"no law for drive = {drive} brings objects to a heading; name one by law"
+        raise errors.not_allowed("law", "None", rule)
+    presets = pose.PRESET_OF if heading else {"omni": law} | unicycle.PRESET_OF
+    return presets[drive]
 
 
 def laws_for(drive: DriveKind) -> list[str]:

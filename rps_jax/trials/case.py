@@ -17,6 +17,7 @@ from rps_jax.world import objects, scene
 from rps_jax.world.objects import ObjectLike
 from rps_jax.world.scene import FRICTION, Friction, Side
 from rps_jax.world.tasks import Task, TaskLike, parse_task
+from rps_jax.world.tasks.base import heading_of
 
 _TARGET = (-2.0, 0.0)  # [m] default
 FrictionLike = str | Friction | tuple[float, float]  # a friction set, or coefficients ground, robot
@@ -61,8 +62,8 @@ class Case(TrialOptions):
     """Target X Y [m] in the world, where the base starts at the origin."""
     law: LawLike | None = None
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
-    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json. By default rps, or unicycle on a
-    base that cannot move sideways."""
+    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json. By default rps, unicycle on a
+    base that cannot move sideways, and pose for a goal with a heading."""
     task: TaskLike = option("reach", kw_only=True)
     """The task: its name, or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
     Changes follow, as corridor,width=1.2. Ranges are drawn by the seed."""
@@ -96,8 +97,11 @@ class Case(TrialOptions):
 
     @property
     def named_law(self) -> LawLike:
-        """The law, or that for the robot's drive if none is named."""
-        return registry.default_law(self.base.drive) if self.law is None else self.law
+        """The law, or that for the robot's drive and the task if none is named."""
+        if self.law is not None:
+            return self.law
+        has_heading = heading_of(self.challenge) is not None
+        return registry.default_law(self.base.drive, heading=has_heading)
 
     @cached_property
     def params(self) -> LawParams:

@@ -596,6 +596,8 @@ _DRIVE = PoseParams(
     beyond=0.05,
     looks=1.0,
 )
+# Names of the presets that are tuned for bases with a drive.
+PRESET_OF = {"omni": "pose", "differential": "pose_drive"}
 PRESETS = {
     "pose": PoseParams(),
     "pose_drive": _DRIVE,  # for bases that cannot move sideways
