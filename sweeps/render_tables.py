@@ -44,12 +44,8 @@ STALE: dict[str, str] = {
     **dict.fromkeys(
         (
             "attack",
-            "fit_bags",
-            "fit_coverage",
             "fit_methods",
             "fit_methods_quantities",
-            "fit_quantities",
-            "fit_worth",
             "rivals_tuned",
         ),
         "tuners got worlds of their own, which no sweep meets",
