@@ -73,11 +73,11 @@ class Influence(NamedTuple):
     q: float  # [1] false discovery rate of the test that all bins have the same rate
 
 
-def wilson(successes: int, trials: int) -> tuple[float, float]:
+def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Return the Wilson score interval of a success rate; [0, 1] without trials."""
     if trials == 0:
         return 0.0, 1.0
-    z = float(scipy.special.ndtri(0.975))
+    z = float(scipy.special.ndtri((1 + confidence) / 2))
     rate, ratio = successes / trials, z * z / trials
     middle = (rate + ratio / 2) / (1 + ratio)
     half_width = z / (1 + ratio) * math.sqrt(rate * (1 - rate) / trials + ratio / trials / 4)

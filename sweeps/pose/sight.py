@@ -106,7 +106,9 @@ _PARAMS = resolve_law("pose")[1]
 _LAW: Any = law_of(_PARAMS)
 _FORM = {"init": init, "step": step, "senses": "pose", "check": lambda params: params, "bounds": ()}
 register_law(
-    "pose_sight", replace(_LAW, temperatures=None, observe_sent=None, **_FORM), SightParams(_PARAMS)
+    "_pose_sight",
+    replace(_LAW, temperatures=None, observe_sent=None, **_FORM),
+    SightParams(_PARAMS),
 )
 
 
