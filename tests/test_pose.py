@@ -23,7 +23,9 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.robot import skin as skins
 from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import CapacitiveSkin
+from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
+from rps_jax.trials.live import Live
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.physics import Physics
@@ -491,3 +493,14 @@ def test_a_push_to_a_goal_with_a_heading_chooses_the_law_by_the_drive(robot, law
             _ = Case(robot=robot, task="pose")
     else:
         assert Case(robot=robot, task="pose").named_law == law
+
+
+def test_a_heading_relative_to_a_face_has_no_arrow_in_the_world_and_no_environment():
+    setting = Setting("fused")
+    live = Live(pushes.build([Case(task="pose,turn=1.5")], setting), setting)
+    live.set_target((1.0, 0.5), 0.3)
+    assert live.yaw_target is None
+    assert "goal" not in live.lines
+    assert float(live._worlds.task.heading[0]) == pytest.approx(1.5)
+    with refusing("environments know only headings in the world"):
+        rps_jax.PushEnv(task="pose,turn=1.5", worlds=2)

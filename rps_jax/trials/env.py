@@ -45,7 +45,7 @@ from rps_jax.world.draws import Draw
 from rps_jax.world.opengl import mujoco
 from rps_jax.world.scene import JOINTS, Scene
 from rps_jax.world.tasks import TaskLike
-from rps_jax.world.tasks.base import heading_of
+from rps_jax.world.tasks.base import heading_of, is_relative
 
 
 class Reward(NamedTuple):
@@ -143,6 +143,9 @@ class PushEnv:
         check_finite_leaves(self.weights)
         with device.standard_jax():
             self._batch  # noqa: B018
+        if is_relative(self.table.task):
+            rule = "environments know only headings in the world: give heading instead"
+            raise errors.not_allowed("task turn", "a relative heading", rule)
 
     # --- the loop ---
 

@@ -24,7 +24,7 @@ from rps_jax.trials.batch import stepper
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
 from rps_jax.trials.worlds import WorldBatch, memory_of, rows
-from rps_jax.world.tasks.base import heading_of
+from rps_jax.world.tasks.base import heading_of, is_relative
 
 CHUNK = 25  # steps, at most, between two checks of the clock
 
@@ -128,7 +128,7 @@ class Live:
             del self.past[index + 1 :]
 
     def set_target(self, p_world_target: tuple[float, float], yaw: float | None = None) -> None:
-        """Move the target [m], and turn its heading to `yaw` [rad] if it has one.
+        """Move the target [m], and turn its heading to `yaw` [rad] if it has one in the world.
 
         Raises:
           InputError: it is not finite, or out of bounds, or the task has its own end.
@@ -139,7 +139,8 @@ class Live:
         dtype = self._worlds.p_world_target.dtype
         goal, task = np.array([target], dtype), self._worlds.task
         if (heading := heading_of(task)) is not None:
-            heading = heading if yaw is None else np.array([yaw], dtype)
+            is_kept = yaw is None or is_relative(task)
+            heading = heading if is_kept else np.array([yaw], dtype)
             task = task._replace(p_world_goal=goal, heading=heading)
         self._worlds = self._worlds._replace(p_world_target=goal, task=task)
         self._continue(min_distance=np.full_like(self._trial.min_distance, np.inf))
@@ -165,9 +166,9 @@ class Live:
 
 
 def yaw_target(worlds: World) -> float | None:
-    """Return the heading of the goal of the first world [rad]; None if it has none."""
+    """Return the heading of the goal of the first world [rad]; None if the world has none."""
     heading = heading_of(worlds.task)
-    return None if heading is None else float(heading[0])
+    return None if heading is None or is_relative(worlds.task) else float(heading[0])
 
 
 @jax.jit

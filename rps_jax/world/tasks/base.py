@@ -81,6 +81,11 @@ def heading_of(course: Course | Task) -> Entries:
     return getattr(course, "heading", None)
 
 
+def is_relative(course: Course) -> bool:
+    """Return whether the heading of a course's goal is relative to a face that a trial feels."""
+    return getattr(course, "relative", None) is not None
+
+
 class CourseInputs(NamedTuple):
     """Numbers of n worlds on which a task's course depends."""
 

@@ -109,7 +109,9 @@ class PoseCourse(NamedTuple):
         return planar.norm(p_world_goal - point)
 
     def lines(self) -> Arrays:
-        """Return the goal's arrow, which ends at its place."""
+        """Return the goal's arrow, which ends at its place; none if its heading is relative."""
+        if self.relative is not None:
+            return {}
         tip = np.asarray(self.p_world_goal, float)
         tail = tip - _ARROW * solid.unit(np.asarray(self.heading, float))
         return {"goal": np.stack([tail, tip], axis=-2)}
