@@ -25,10 +25,43 @@ T = TypeVar("T")
 SPEC = "spec"  # key in the metadata of a field of a dataclass
 LIMITS = ("ge", "gt", "le", "lt")  # at least, above, at most, below; names of `annotated_types`
 # Symbols of units; a unit is a product or quotient of their powers, as kg m^2 or m/s^2.
-_SYMBOLS = """
-1 % m mm km in rad deg s ms us ns min h d g kg t N J W Hz kHz GHz V F pF bytes kB MB GB px frame
-"""
-SYMBOLS = frozenset(re.findall(r"\S+", _SYMBOLS))
+SYMBOLS = frozenset(
+    [
+        "1",
+        "%",
+        "m",
+        "mm",
+        "km",
+        "in",
+        "rad",
+        "deg",
+        "s",
+        "ms",
+        "us",
+        "ns",
+        "min",
+        "h",
+        "d",
+        "g",
+        "kg",
+        "t",
+        "N",
+        "J",
+        "W",
+        "Hz",
+        "kHz",
+        "GHz",
+        "V",
+        "F",
+        "pF",
+        "bytes",
+        "kB",
+        "MB",
+        "GB",
+        "px",
+        "frame",
+    ]
+)
 _FACTOR = re.compile(r"([A-Za-z%1]+)(\^-?\d+)?")
 
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import Setting, register_law
+from rps_jax import Robot, Setting, register_law
 from rps_jax.analysis import tables
 from rps_jax.laws import law_of, resolve_law
 from rps_jax.questions import Plan, Run, call_of, option
@@ -33,7 +33,7 @@ _ROWS = (
     "wide, boxes | differential | 0.2 m/s",
     "hostile, boxes | omnidirectional | 0.2 m/s",
 )
-_AHEAD = 0.3625  # [m] the paper's front, from the middle of its base
+_AHEAD = Robot().shell.half[0]  # [m] the paper's front, from the middle of its base
 _FLUSH = 0.01  # [rad] between a flush face and the front
 _SPREAD = 0.3  # share of the interval of a tuned parameter by which a try changes it, at most
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import fnmatch
 import json
 import re
-import subprocess
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,10 +17,9 @@ from typing import Any
 
 import xarray as xr
 
-from rps_jax import InputError
 from rps_jax.questions import Run, call_of
 from sweeps.publish.study import published
-from sweeps.study_base import Study, Table, records, text_table
+from sweeps.study_base import Study, Table, records, run_process, text_table
 
 # Change behind moved numbers, by patterns of table and row; the first that matches counts.
 WHY = {
@@ -85,13 +83,10 @@ moved = call_of(Moved)
 def _data_files(commit: str) -> dict[str, str]:
     """Return the texts of the data files of a commit, by name."""
 
+    problem = f"since = {commit!r}: git finds no such commit in this folder's history"
+
     def git(*words: str) -> str:
-        process = subprocess.run(("git", *words), capture_output=True, text=True, check=False)
-        if process.returncode:
-            raise InputError(
-                f"since = {commit!r}: git finds no such commit in this folder's history."
-            )
-        return process.stdout
+        return run_process(["git", *words], problem)
 
     paths = git("ls-tree", "-r", "--full-tree", "--name-only", commit, "sweeps").split()
     results = [path for path in paths if fnmatch.fnmatch(path, "*/results/*.json")]

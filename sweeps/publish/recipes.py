@@ -82,7 +82,7 @@ _HARDWARE = {
     "`rps_unsaturated`, ideal": " --law rps_unsaturated --robot ideal",
 }
 _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
-_PRESET = "sweep --domain wide --worlds 1000 --seed 9243"
+_IN_WIDE = "sweep --domain wide --worlds 1000 --seed 9243"
 _PRESETS = ("turtlebot4", "jackal", "husky", "mir100", "pioneer_3dx")
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
 _FORMER = "sweeps/learned/learned_0_4.npz"  # `learned` of 0.4
@@ -337,9 +337,9 @@ RECIPES: dict[str, Recipe] = {
         columns=_RATES,
     ),
     "presets": recipe(
-        *_each(f"rps {_PRESET} --robot {{0}} --laws unicycle --out runs/preset_{{0}}", *_PRESETS),
-        f"rps {_PRESET} --robot f1tenth --laws unicycle_car --out runs/preset_f1tenth",
-        f"rps {_PRESET} --robot f1tenth --laws unicycle_car --max-lost 600 --out runs/preset_600",
+        *_each(f"rps {_IN_WIDE} --robot {{0}} --laws unicycle --out runs/preset_{{0}}", *_PRESETS),
+        f"rps {_IN_WIDE} --robot f1tenth --laws unicycle_car --out runs/preset_f1tenth",
+        f"rps {_IN_WIDE} --robot f1tenth --laws unicycle_car --max-lost 600 --out runs/preset_600",
         gpu=2,
         section="Success",
         labels=(*_PRESETS, "f1tenth", "f1tenth, 600 s without contact"),

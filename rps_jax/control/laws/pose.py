@@ -91,7 +91,7 @@ _TURNS = 0.8  # [rad] between base and leg, up to which it feels the box and tur
 
 
 def _tuned(
-    unit: str, about: str, low: float, high: float, log: bool = False, **limits: Any
+    unit: str, about: str, low: float, high: float, *, log: bool = False, **limits: Any
 ) -> Spec:
     """Declare a parameter that is not negative, and the interval in which it is tuned."""
     return Spec(unit, about, tune=Bound(low, high, log), **(limits or {"ge": 0}))
@@ -123,11 +123,11 @@ class PoseParams(NamedTuple):
     slope: Annotated[Parameter, _tuned("1", "sideways over forward speed, Q6", 0.02, 0.6)] = 0.2135
     K_y: Annotated[
         Parameter,
-        _tuned("1/s", "gain of the sideways speed, Q6", 0.02, 2, True),
+        _tuned("1/s", "gain of the sideways speed, Q6", 0.02, 2, log=True),
     ] = 0.2
     K_h: Annotated[
         Parameter,
-        _tuned("rad/m", "gain of the heading, Q6 and Q10", 0.1, 6, True),
+        _tuned("rad/m", "gain of the heading, Q6 and Q10", 0.1, 6, log=True),
     ] = 1.798
     h_max: Annotated[Parameter, _tuned("rad", "bound of this heading", 0.01, 0.8)] = 0.7169
     turn: Annotated[Parameter, _tuned("1", "share of the sharpest turn, Q10", 0.3, 1.2)] = 0.5994
@@ -138,11 +138,11 @@ class PoseParams(NamedTuple):
     s_line: Annotated[Parameter, _tuned("m", "straight end of the last leg, Q4", 0, 0.8)] = 0.3371
     K_e: Annotated[
         Parameter,
-        _tuned("1/m", "curvature for an error of the heading, Q10", 1, 20, True),
+        _tuned("1/m", "curvature for an error of the heading, Q10", 1, 20, log=True),
     ] = 9.391
     omega_push: Annotated[
         Parameter,
-        _tuned("rad/s", "bound on |omega| in contact", 0.005, 0.15, True, gt=0),
+        _tuned("rad/s", "bound on |omega| in contact", 0.005, 0.15, log=True, gt=0),
     ] = 0.03
     l_edge: Annotated[Parameter, _tuned("m", "offset of a bad contact, Q7", 0.05, 0.3)] = 0.1418
     l_turn: Annotated[Parameter, _tuned("m", "the same, of an uneven contact, Q7", 0.1, 0.3)] = (
