@@ -226,10 +226,10 @@ RECIPES: dict[str, Recipe] = {
     "attack": recipe(
         "rps attack --law rps_tuned --domain wide --minutes 3.5 --batch 64 --repeats 3 "
         "--drawn 600 --check-again 8",
-        "rps attack --law rps_plus --domain wide --minutes 13 --batch 128 --repeats 2 "
+        "rps attack --law rps_plus --domain wide --minutes 6 --batch 128 --repeats 2 "
         "--drawn 256 --check-again 24",
         "rps attack --law rps_plus --domain wide --axes height size friction_ground "
-        "--minutes 5 --batch 96 --repeats 2 --drawn 64 --check-again 12",
+        "--minutes 4 --batch 96 --repeats 2 --drawn 64 --check-again 12",
         cores=30,
         section=rows.attack_table,
         labels=("rps_tuned", "rps_plus", "rps_plus, three axes"),
@@ -351,7 +351,7 @@ RECIPES: dict[str, Recipe] = {
         gpu=3,
     ),
     "floors_*": recipe(f"rps sweeps/floors {_MACHINE}", cores=30, gpu=2),
-    "tasks_parity": recipe(f"rps sweeps/corridors/parity.py {_MACHINE}", cores=90),
+    "tasks_parity": recipe(f"rps sweeps/corridors/parity.py --part 300 {_MACHINE}", cores=90),
     "tasks_cost_cpu": recipe(f"rps sweeps/corridors/costs.py {_MACHINE}", cores=3),
     "tasks_cost_gpu": recipe(
         f"rps sweeps/corridors/costs.py --worlds 16384 --rounds 6 {_MACHINE}", gpu=2
