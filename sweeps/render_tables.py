@@ -47,7 +47,7 @@ STALE: dict[str, str] = {
             "fit_methods",
             "fit_methods_quantities",
         ),
-        "tuners got worlds of their own, which no sweep meets",
+        "tuners got separate worlds, which no sweep meets",
     ),
     **dict.fromkeys(("ground",), "a push ran in the program of a sweep, with other last bits"),
     **dict.fromkeys(
