@@ -85,12 +85,10 @@ STALE: dict[str, str] = {
     **dict.fromkeys(
         (
             "force_push_paths",
-            "headline",
             "learned_failures",
             "learned_test",
             "learned_windows",
             "million",
-            "models",
         ),
         "`learned` was trained between walls, too",
     ),
