@@ -47,6 +47,7 @@ def test_the_interval_of_a_paired_difference_covers(gains, losses):
     for gained in range(trials + 1):
         for lost in range(trials + 1 - gained):
             low, high = statistics.Comparison(gained, lost, 1.0).interval(trials)
+            assert -1 <= low <= high <= 1
             if low <= gains - losses <= high:
                 rest = trials - gained - lost
                 shares = [gains, losses, 1 - gains - losses]

@@ -44,12 +44,13 @@ class Comparison(NamedTuple):
     def interval(self, trials: int) -> tuple[float, float]:
         """Return the interval (95 %) of the difference of the rates [1], of paired trials.
 
-        Half a trial is added to each of the four outcomes of a pair (Agresti and Min, 2005).
+        Half a trial is added to each of the four outcomes of a pair (Agresti and Min, 2005); bounds
+        are cut at -1 and 1.
         """
         gained, lost, total = self.gained + 0.5, self.lost + 0.5, trials + 2
         middle = (gained - lost) / total
         half_width = 1.96 * math.sqrt(((gained + lost) / total - middle**2) / total)
-        return middle - half_width, middle + half_width
+        return max(-1.0, middle - half_width), min(1.0, middle + half_width)
 
     @property
     def changes(self) -> str:

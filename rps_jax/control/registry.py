@@ -139,7 +139,8 @@ def check_room(params: LawParams, task: str, room: float) -> None:
     """Raise InputError unless a task leaves the law `room` [m] around the object."""
     if (needed := law_of(params).room) > room:
         name = f"{task} with the law {_name_of(params)}"
-        rule = f"its detours need {needed:g} m without walls around the object, not {room:g} m"
+        rule = f"its detours need {needed:g} m without walls around the object, "
+        rule += f"not {room:g} m" if room else f"which {task} does not promise"
         raise errors.not_allowed("task", name, f"{rule}; choose a wider one, or another law")
 
 
@@ -150,7 +151,7 @@ def check_drive(params: LawParams, drive: DriveKind) -> None:
     known = " or ".join(laws_for(drive))
     rule = f"it moves sideways, which a base with drive = {drive} cannot; choose {known}"
     if not type(params).__module__.startswith("rps_jax."):
-        rule += ", or declare Law(drives=...) of this one"
+        rule += f', or declare Law(..., drives=("{drive}",)) of this one if it does not'
     raise errors.not_allowed("law", _name_of(params), rule)
 
 
