@@ -17,6 +17,7 @@ from helpers import (
 from numpy.testing import assert_array_equal
 
 import rps_jax
+from rps_jax.analysis import figures
 from rps_jax.geometry.footprint import polygon
 from rps_jax.record import files
 from rps_jax.runs.sweep import merge
@@ -182,3 +183,8 @@ def test_the_examples_of_docstrings_run(name, tmp_path, monkeypatch, registries)
     runner = doctest.DocTestRunner(optionflags=OPTIONS)
     for example in examples(name):
         assert runner.run(example, out=lines.append).failed == 0, "".join(lines)
+
+
+def test_the_former_name_of_a_module_of_figures_warns():
+    with pytest.warns(FutureWarning, match="write sweeps"):
+        assert figures.tuning.__name__ == "rps_jax.analysis.figures.sweeps"

@@ -14,6 +14,7 @@ import scipy
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from rps_jax import errors
 from rps_jax.world import tasks
 from rps_jax.world.domain import LABELS
 
@@ -263,6 +264,9 @@ def influences(results: xr.Dataset) -> list[Influence]:
     """Return the influence of each of `varied_quantities`, the greatest variance first.
 
     An influence has the greatest variance, and the least q, among the laws.
+
+    Raises:
+      InputError: the laws ran in different worlds.
     """
 
     def bins_of(name: str) -> list[Bins]:
@@ -270,6 +274,9 @@ def influences(results: xr.Dataset) -> list[Influence]:
         return [Bins(middle, by_bin, trials) for by_bin in successes]
 
     names, laws = varied_quantities(results), results.law.values
+    if different := [name for name in names if results[name].dims != ("world",)]:
+        rule = "it differs between the laws: join runs of the same domain, seed and worlds"
+        raise errors.not_allowed("results", different[0], rule)
     with ThreadPoolExecutor() as pool:  # sorting a million numbers takes long
         binned = dict(zip(names, pool.map(bins_of, names), strict=True))
     q = false_discovery([equal_rates_p(b) for by_law in binned.values() for b in by_law])

@@ -139,8 +139,7 @@ def check_room(params: LawParams, task: str, room: float) -> None:
     """Raise InputError unless a task leaves the law `room` [m] around the object."""
     if (needed := law_of(params).room) > room:
         name = f"{task} with the law {_name_of(params)}"
-        rule = f"its detours need {needed:g} m without walls around the object, "
-        rule += f"not {room:g} m" if room else f"which {task} does not promise"
+        rule = f"its detours need {needed:g} m without walls around the object, not {room:g} m"
         raise errors.not_allowed("task", name, f"{rule}; choose a wider one, or another law")
 
 

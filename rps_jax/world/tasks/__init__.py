@@ -67,7 +67,7 @@ _RANGE = "a number, or low and high as [0.3, 0.6]"
 _FORMS = {
     bool: "true or false",
     int: "a whole number",
-    2: "pairs of x, y [m]; only the task pose has a heading",
+    2: "pairs of x, y [m], without a heading",
     3: "x, y, yaw",
 }
 
