@@ -12,9 +12,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from staging import FINE, simulate, step_in_c
 
 from rps_jax import engines
+from rps_jax.control import registry
 from rps_jax.engines import finger, quasistatic
 from rps_jax.geometry import solid
 from rps_jax.geometry.friction import friction_of_pads, solved
+from rps_jax.runs.model_panel import model_plans
+from rps_jax.runs.plan import Plan
 from rps_jax.trials import pushes, worlds
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
@@ -255,5 +258,7 @@ def test_supports_without_sense_are_refused():
         parse_domain("wide,support=even,feet=0.5:0.9")
     domain = parse_domain("wide,objects=random_box,support=even")
     drawn = draws.draw(domain, 0, np.arange(2))
+    plan = Plan(domain, 2, {"rps": registry.LAWS["rps"]}, Setting(), 2)
+    assert not [x for x in model_plans(plan).values() if x.setting.physics.cone == "pyramidal"]
     with refusing("cone"):
         worlds.drawn_worlds(domain, drawn, Setting(physics="paper_gazebo"))

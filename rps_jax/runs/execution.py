@@ -56,7 +56,7 @@ def run_missing(
     """
     missing, finished = missing_chunks(folder, plan, shard)
     callback(Progress(finished, 0.0))
-    if missing:
+    if missing or not finished:  # a shard may have no trials
         slots = {"slots": size.get("slots")}  # on which the bits depend
         provenance.write_environment(folder, device.collect_environment() | slots)
 

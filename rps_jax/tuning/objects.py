@@ -487,7 +487,8 @@ class FitObject(Question[ObjectFit]):
         text = (
             f"The friction between object and finger is {results.friction:.2f}. The object's "
             f"weight acts at ({x:.1f}, {y:.1f}) mm: give its file this centre of mass. "
-            f"{results.misplaced} The gap at the end of the pushes is {gap:.2f} mm (median)."
+            f"{results.misplaced} The gap at the end of the pushes is {gap:.2f} mm (median). "
+            "The parameters ring to quatrefoil_y shape the logarithm of the pressure."
         )
         return [Section("Parameters", text, rows)]
 

@@ -143,6 +143,11 @@ def check_object(kind: str, name: str, *more: str) -> str:
     return errors.check_name(kind, name, known, "FILE.xml")
 
 
+def is_on_pads(name: str) -> bool:
+    """Return whether a custom object stands on pads, or on feet with weights."""
+    return name in REGISTERED and REGISTERED[name].solid.pads is not None
+
+
 def text_of(name: str) -> str:
     """Return the text from which another process parses an object: its file, or its name."""
     custom = REGISTERED.get(name)
