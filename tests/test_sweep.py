@@ -374,6 +374,18 @@ def test_another_configuration_is_refused_with_its_differences(whole):
         open_run(whole, changed_plan)
 
 
+def test_a_run_of_version_0_4_is_replayed(whole, tmp_path):
+    """Its manifest has no drive of the robot."""
+    folder = shutil.copytree(whole, tmp_path / "old")
+    record = json.loads((folder / "manifest.json").read_text())
+    assert record["domain"]["robot"].pop("drive") == "omni"
+    files.write_json(folder / "manifest.json", record, checked=True)
+    assert load_plan(folder) == PLAN
+    record["domain"]["robot"]["drive"] = "differential"
+    files.write_json(folder / "manifest.json", record, checked=True)
+    assert load_plan(folder) != PLAN
+
+
 def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
     tuned, drums, run = (tmp_path / name for name in ("tuned.json", "drums.json", "run"))
     tuned.write_text(json.dumps({"L": 0.3, "saturate_first": 0}))
