@@ -147,7 +147,8 @@ def _differences(stored: object, new: object, path: str) -> Iterator[str]:
         if "file" not in new and files.suffix_of(str(stored.get("file"))) == ".npz":
             skipped = {"file", "digest"}  # of a policy that is shipped now; its class has a digest
         for key in (key for key in {**stored, **new} if key not in skipped):
-            pair = [x.get(key, _ABSENT.get(key)) for x in (stored, new)]
+            absent = _ABSENT.get(key)
+            pair = stored.get(key, absent), new.get(key, absent)
             yield from _differences(*pair, f"{path}.{key}" if path else key)
     elif stored != new:
         yield f"{path} = {_SHORT.repr(stored)} there, {_SHORT.repr(new)} asked for"
