@@ -16,9 +16,12 @@ __version__ = "0.5.0"
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
 _HOMES = {name: home for home, name in re.findall(r"^from (\S+) import (\w+) as", _STUB, re.M)}
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+_MODULES = ("errors", "laws", "physics", "questions", "worlds")  # with further public names
 
 
 def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return importlib.import_module(f"{__name__}.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'rps_jax' has no attribute '{name}'")
     return getattr(importlib.import_module(_HOMES[name]), name)

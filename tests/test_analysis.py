@@ -6,7 +6,7 @@ import chromium
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import results_of
+from helpers import refusing, results_of
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy import stats
@@ -47,6 +47,7 @@ def test_the_interval_of_a_paired_difference_covers(gains, losses):
     for gained in range(trials + 1):
         for lost in range(trials + 1 - gained):
             low, high = statistics.Comparison(gained, lost, 1.0).interval(trials)
+            assert -1 <= low <= high <= 1
             if low <= gains - losses <= high:
                 rest = trials - gained - lost
                 shares = [gains, losses, 1 - gains - losses]
@@ -124,6 +125,8 @@ def test_the_decisive_quantity_is_listed_first():
     drawn = {"mass": index * 1.0, "friction_ground": index % 7 * 1.0}
     results = random_worlds((index < 350)[None], **drawn)
     mass, friction = statistics.influences(results)
+    with refusing("join runs of the same domain, seed and worlds"):
+        statistics.influences(results.assign_coords(mass=results.mass * results.success))
     assert mass.name == "mass"
     assert mass.q < 1e-10
     binned = statistics.bins(results.mass.values, results.success.values > 0)

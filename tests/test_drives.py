@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import observation, refusals, refusing
+from helpers import ROOT, observation, refusals, refusing
 
 from rps_jax import draw_worlds, engines, rollout
 from rps_jax.app.cli import flags, names
@@ -200,6 +200,9 @@ def test_presets_and_files_of_robots_are_valid(tmp_path):
     mine = {"half_length": 0.3, "half_width": 0.2, "drive": "car", "turning_radius": 0.6}
     mine |= {"boards": [{"side": "front", "count": 2}]}
     path = tmp_path / "mine.json"
+    page = (ROOT / "docs/my_robot.md").read_text()
+    path.write_text(page.split("```json\n")[1].split("```")[0])
+    assert parse_robot(str(path)).drive == "differential"
     path.write_text(json.dumps(mine))
     parsed = parse_robot(f"{path},axle=0.1")
     assert (parsed.drive, parsed.axle, parsed.turning_radius) == ("car", 0.1, 0.6)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import refusing, rps
+from helpers import refusal, refusing, rps
 from numpy.testing import assert_allclose
 
 import rps_jax
@@ -159,7 +159,7 @@ def table_of(pushes):
     return pd.DataFrame(rows, columns=list(objects._COLUMNS))
 
 
-def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_path):
+def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_path, capsys):
     table = table_of(Pushes(*(x[:6] for x in measured)))
     table.to_csv(tmp_path / "pushes.csv", index=False)
     pd.DataFrame(SQUARE, columns=["x", "y"]).to_csv(tmp_path / "outline.csv", index=False)
@@ -182,5 +182,9 @@ def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_
         rps_jax.fit_object(SQUARE, table.assign(tip_x=1.0 + table.tip_x), RADIUS)
     with refusing("give 3 to 64 points"):
         rps_jax.fit_object(SQUARE, table, RADIUS, feet=SQUARE[:2])
-    with refusing("lack the column"):
+    with refusing("lacks the column"):
         rps_jax.fit_object(SQUARE, table.drop(columns="yaw"), RADIUS)
+    table.drop(columns="yaw").to_csv(tmp_path / "pushes.csv")
+    message = refusal(capsys, "fit object", *paths, "--out", tmp_path / "refused")
+    assert "lacks the column yaw: add what is missing." in message
+    assert not (tmp_path / "refused").exists()

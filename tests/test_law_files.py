@@ -107,6 +107,12 @@ def test_a_push_says_that_the_law_returned_nan(tmp_path):
     assert trace.summary == "diverged at 0.00 s, since the law returned NaN"
 
 
+def test_a_push_accepts_a_twist_as_a_plain_tuple(tmp_path):
+    path = write_law(tmp_path)
+    path.write_text(path.read_text().replace("Twist(params.v", "(params.v"))
+    assert_allclose(push("box", law=str(path), setting=BRIEF).data.v_x, 0.05)
+
+
 def test_shadow_counts_twists_that_are_not_finite(tmp_path):
     from rps_jax.app.shadow import Shadow
 

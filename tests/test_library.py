@@ -3,6 +3,7 @@
 import doctest
 import inspect
 import pkgutil
+import sys
 
 import pytest
 import xarray as xr
@@ -11,12 +12,14 @@ from helpers import (
     SLOTS,
     addresses,
     docstrings,
+    output_of,
     rps,
     setting_of,
 )
 from numpy.testing import assert_array_equal
 
 import rps_jax
+from rps_jax.analysis import figures
 from rps_jax.geometry.footprint import polygon
 from rps_jax.record import files
 from rps_jax.runs.sweep import merge
@@ -182,3 +185,14 @@ def test_the_examples_of_docstrings_run(name, tmp_path, monkeypatch, registries)
     runner = doctest.DocTestRunner(optionflags=OPTIONS)
     for example in examples(name):
         assert runner.run(example, out=lines.append).failed == 0, "".join(lines)
+
+
+def test_the_former_name_of_a_module_of_figures_warns():
+    with pytest.warns(FutureWarning, match="write sweeps"):
+        assert figures.tuning.__name__ == "rps_jax.analysis.figures.sweeps"
+
+
+def test_modules_of_public_names_need_no_import_of_their_own():
+    """As in the sentence `rps_jax.laws.Bound(low, high)` of an error."""
+    code = "import rps_jax; print(rps_jax.laws.Bound(1, 2), rps_jax.worlds.Case, rps_jax.physics)"
+    assert output_of(sys.executable, "-c", code).startswith("Bound(")

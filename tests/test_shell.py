@@ -133,6 +133,9 @@ def test_presets_have_as_many_boards_as_fit():
         ROBOTS[name].check()
 
 
+_FRONT = '{"side": "front", "count": 2}'
+
+
 def test_boards_go_through_json(tmp_path):
     rows = [{"side": "front", "count": 2, "pitch": 0.05}, {"side": "right", "count": 1}]
     values = {"half_width": 0.3, "boards": rows}
@@ -148,6 +151,12 @@ def test_commands_refuse_them_in_one_sentence(capsys, tmp_path):
         ('{"boards": [{"count": 9}]}', "sweep", "write each row as"),
         ('{"boards": [{"side": "front", "count": 1, "width": 1}]}', "sweep", "quantity 'width'"),
         ('{"half_length": 1.5}', "sweep", "which reaches 1.53 m"),
+        (f'{{"boards": [{_FRONT}, {_FRONT}]}}', "sweep", "overlap the previous row"),
+        (
+            f"""{{"boards": [{_FRONT}, {_FRONT.replace("front", "left")}]}}""",
+            "sweep",
+            "left, front",
+        ),
         ('{"half_length": 1.5}', "push --target 1 0", "outside the robot"),
     ):
         mine.write_text(text)

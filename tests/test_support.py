@@ -12,9 +12,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from staging import FINE, simulate, step_in_c
 
 from rps_jax import engines
-from rps_jax.engines import quasistatic
+from rps_jax.control import registry
+from rps_jax.engines import finger, quasistatic
 from rps_jax.geometry import solid
 from rps_jax.geometry.friction import friction_of_pads, solved
+from rps_jax.runs.model_panel import model_plans
+from rps_jax.runs.plan import Plan
 from rps_jax.trials import pushes, worlds
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
@@ -173,21 +176,41 @@ def test_a_box_turns_by_its_pressure_in_every_engine(engine, kind, integrals):
     assert 1 - turn_in(engine, *inputs_of("box", "corners")) / turned > 0.05
 
 
-@pytest.mark.parametrize("engine", ["fused", "mujoco", "quasistatic", slow("mjx")])
-def test_weights_and_friction_of_feet_turn_a_cart(engine, tmp_path, registries):
-    """Castors in front leave the friction to the rear feet."""
+@pytest.fixture
+def turn_on(tmp_path, registries):
+    """The turn of a registered box on feet (S, 2) to (S, 5), in an engine."""
     path = tmp_path / "cart.xml"
     box = (objects.mjcf_folder() / "box.xml").read_text().replace("0.20 0.20 0.40", "0.2 0.2 0.1")
     path.write_text(re.sub('pos="[^"]*"', "", box))
-    at = solid.rectangles(np.array([0.18]), np.array([0.18]))[0]
-    turns = []
-    for name, castor, weight in (("plain", 1.0, 1.0), ("cart", 0.02, 1.0), ("heavy", 1.0, 3.0)):
-        rows = np.column_stack([at, [1, 1, 1, weight], [castor, 1, 1, castor]])
-        objects.register_object(name, path, feet=rows)
-        row = solid.stack([objects.REGISTERED[name].solid])
+
+    def turn(engine, feet):
+        objects.register_object("cart", path, feet=feet)
+        row = solid.stack([objects.REGISTERED["cart"].solid])
         inputs, qpos = inputs_of("box", "corners")
-        turns.append(turn_in(engine, inputs._replace(family="prism", solids=row), qpos))
-    plain, cart, heavy = turns
+        return turn_in(engine, inputs._replace(family="prism", solids=row), qpos)
+
+    return turn
+
+
+@pytest.mark.parametrize("engine", ["fused", "mujoco", "quasistatic"])
+def test_an_object_is_registered_on_the_pads_of_a_fit(engine, turn_on, integrals):
+    """Pads of even pressure turn it as the integral over the pressure."""
+    pads = finger.uniform_pads(OUTLINES["box"][0], 14)
+    feet = np.insert(pads, 3, 1.0, axis=1)
+    assert len(feet) > solid.SIDES
+    assert turn_on(engine, feet) == pytest.approx(integrals["even"], rel=0.03)
+    with refusing("radii at least 0"):
+        turn_on(engine, feet * [1, 1, 1, 1, -1])
+
+
+@pytest.mark.parametrize("engine", ["fused", "mujoco", "quasistatic", slow("mjx")])
+def test_weights_and_friction_of_feet_turn_a_cart(engine, turn_on):
+    """Castors in front leave the friction to the rear feet."""
+    at = solid.rectangles(np.array([0.18]), np.array([0.18]))[0]
+    plain, cart, heavy = (
+        turn_on(engine, np.column_stack([at, [1, 1, 1, weight], [castor, 1, 1, castor]]))
+        for castor, weight in ((1.0, 1.0), (0.02, 1.0), (1.0, 3.0))
+    )
     assert (cart - plain) / plain > 0.1
     assert abs(heavy - plain) > 0.002
 
@@ -235,5 +258,7 @@ def test_supports_without_sense_are_refused():
         parse_domain("wide,support=even,feet=0.5:0.9")
     domain = parse_domain("wide,objects=random_box,support=even")
     drawn = draws.draw(domain, 0, np.arange(2))
+    plan = Plan(domain, 2, {"rps": registry.LAWS["rps"]}, Setting(), 2)
+    assert not [x for x in model_plans(plan).values() if x.setting.physics.cone == "pyramidal"]
     with refusing("cone"):
         worlds.drawn_worlds(domain, drawn, Setting(physics="paper_gazebo"))

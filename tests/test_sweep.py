@@ -356,7 +356,8 @@ def test_the_report_of_one_world_has_the_command_that_replays_its_failure(whole,
 
 
 def test_shards_merge_to_the_whole(whole, tmp_path):
-    folders = [swept(tmp_path / f"{k}", shard=Shard(k, 3)) for k in (1, 2, 3)]
+    shards = Shard(1, 3), Shard(2, 3), Shard(3, 3), Shard(7, 7)  # the last has none of the 6 parts
+    folders = [swept(tmp_path / f"{k}", shard=shard) for k, shard in enumerate(shards)]
     with refusing("lacks 2 of 6 parts"):
         merge(folders[:2], out=tmp_path)
     (tmp_path / "direct").mkdir()
@@ -371,6 +372,18 @@ def test_another_configuration_is_refused_with_its_differences(whole):
     changed_plan = replace(PLAN, worlds=30, domain=replace(BOXES, mass=Range(1, 2)))
     with refusing(r"domain.mass = .*there, .* asked for; worlds = 20 there"):
         open_run(whole, changed_plan)
+
+
+def test_a_run_of_version_0_4_is_replayed(whole, tmp_path):
+    """Its manifest has no drive of the robot."""
+    folder = shutil.copytree(whole, tmp_path / "old")
+    record = json.loads((folder / "manifest.json").read_text())
+    assert record["domain"]["robot"].pop("drive") == "omni"
+    files.write_json(folder / "manifest.json", record, checked=True)
+    assert load_plan(folder) == PLAN
+    record["domain"]["robot"]["drive"] = "differential"
+    files.write_json(folder / "manifest.json", record, checked=True)
+    assert load_plan(folder) != PLAN
 
 
 def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):

@@ -14,6 +14,7 @@ import scipy
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from rps_jax import errors
 from rps_jax.world import tasks
 from rps_jax.world.domain import LABELS
 
@@ -44,12 +45,13 @@ class Comparison(NamedTuple):
     def interval(self, trials: int) -> tuple[float, float]:
         """Return the interval (95 %) of the difference of the rates [1], of paired trials.
 
-        Half a trial is added to each of the four outcomes of a pair (Agresti and Min, 2005).
+        Half a trial is added to each of the four outcomes of a pair (Agresti and Min, 2005); bounds
+        are cut at -1 and 1.
         """
         gained, lost, total = self.gained + 0.5, self.lost + 0.5, trials + 2
         middle = (gained - lost) / total
         half_width = 1.96 * math.sqrt(((gained + lost) / total - middle**2) / total)
-        return middle - half_width, middle + half_width
+        return max(-1.0, middle - half_width), min(1.0, middle + half_width)
 
     @property
     def changes(self) -> str:
@@ -262,6 +264,9 @@ def influences(results: xr.Dataset) -> list[Influence]:
     """Return the influence of each of `varied_quantities`, the greatest variance first.
 
     An influence has the greatest variance, and the least q, among the laws.
+
+    Raises:
+      InputError: the laws ran in different worlds.
     """
 
     def bins_of(name: str) -> list[Bins]:
@@ -269,6 +274,9 @@ def influences(results: xr.Dataset) -> list[Influence]:
         return [Bins(middle, by_bin, trials) for by_bin in successes]
 
     names, laws = varied_quantities(results), results.law.values
+    if different := [name for name in names if results[name].dims != ("world",)]:
+        rule = "it differs between the laws: join runs of the same domain, seed and worlds"
+        raise errors.not_allowed("results", different[0], rule)
     with ThreadPoolExecutor() as pool:  # sorting a million numbers takes long
         binned = dict(zip(names, pool.map(bins_of, names), strict=True))
     q = false_discovery([equal_rates_p(b) for by_law in binned.values() for b in by_law])

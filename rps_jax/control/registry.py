@@ -150,7 +150,7 @@ def check_drive(params: LawParams, drive: DriveKind) -> None:
     known = " or ".join(laws_for(drive))
     rule = f"it moves sideways, which a base with drive = {drive} cannot; choose {known}"
     if not type(params).__module__.startswith("rps_jax."):
-        rule += ", or declare Law(drives=...) of this one"
+        rule += f', or declare Law(..., drives=("{drive}",)) of this one if it does not'
     raise errors.not_allowed("law", _name_of(params), rule)
 
 

@@ -28,7 +28,6 @@ from rps_jax.control.observation import Twist
 from rps_jax.engines import device
 from rps_jax.engines.native import once_differentiable
 from rps_jax.geometry.arrays import Float, Pytree
-from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Surroundings, WorldInputs
@@ -141,9 +140,9 @@ class Engine(abc.ABC):
         if robot.driven and not self.forces:
             raise self._refused("a robot with a limited force needs fused, mjx or mujoco")
 
-    def check_pads(self, solids: Solid, physics: Physics) -> None:
-        """Raise InputError unless the cone can be that of solids on pads."""
-        if solids.pads is not None and physics.cone == "pyramidal":
+    def check_pads(self, has_pads: bool, physics: Physics) -> None:
+        """Raise InputError unless the cone can be that of solids, which may have pads."""
+        if has_pads and physics.cone == "pyramidal":
             rule = "objects with weights of feet or a distributed support need elliptic"
             raise errors.not_allowed("cone", physics.cone, rule)
 

@@ -73,10 +73,10 @@ def check_outline(outline: ArrayLike) -> np.ndarray:
     side = cross(way[:, None], corners - corners[:, None])  # of corner j from edge i
     separated = side * np.roll(side, -1, axis=1) < 0  # the ends of edge j from edge i
     if np.any(separated & separated.T):
-        raise errors.not_allowed("outline", corners.tolist(), "its sides must not cross")
+        raise errors.not_allowed("outline", f"{len(corners)} corners", "its sides must not cross")
     area = cross(corners, ahead).sum() / 2
     if abs(area) < 1e-3 * size**2:
-        raise errors.not_allowed("outline", corners.tolist(), "it must enclose an area")
+        raise errors.not_allowed("outline", f"{len(corners)} corners", "it must enclose an area")
     return corners if area > 0 else corners[::-1]
 
 

@@ -23,9 +23,10 @@ SIDES = 8  # vertices of a prism at most; those of fewer sides repeat some
 Support = Literal["corners", "even", "rim"]
 SUPPORTS: dict[str, float] = {"even": 0.0, "rim": 1.0, "corners": 2.0}  # kinds of `on_support`
 _OUTER, _INNER = 12, 4  # cells of an outline, beyond and within half of the way to it
+PADS = _OUTER + _INNER
 _NODES = 8  # of the quadrature in an outer cell
 _PAD = 0.82  # [1] radius of a pad over the root mean square distance of its cell's points
-_LOAD = 4.0  # [1] sum of the weights of pads: that of the corners of a box
+LOAD = 4.0  # [1] sum of the weights of pads: that of the corners of a box
 
 
 class Solid(NamedTuple):
@@ -145,17 +146,17 @@ def on_support(solid: Solid, kind: np.ndarray) -> Solid:
         cell = np.floor(_OUTER * angle + 0.5).astype(int) % _OUTER
         real = np.any(vertices != np.roll(vertices, 1, axis=1), axis=2).astype(float)
         parts.append((np.maximum(kind - 1, 0), vertices, real, cell))
-    moments = np.zeros((len(kind), _OUTER + _INNER, 4))
+    moments = np.zeros((len(kind), PADS, 4))
     for share, points, load, cell in parts:
         load = load * (share / load.sum(axis=1))[:, None]
         columns = np.stack([np.ones(load.shape), *points.T.swapaxes(1, 2), (points**2).sum(2)], 2)
-        is_in = (cell[..., None] == np.arange(_OUTER + _INNER)).astype(float)
+        is_in = (cell[..., None] == np.arange(PADS)).astype(float)
         moments += is_in.swapaxes(1, 2) @ (load[..., None] * columns)
     mass = moments[..., :1]
     mean = moments[..., 1:] / np.where(mass > 0, mass, 1)
     spread = np.maximum(mean[..., 2] - np.sum(mean[..., :2] ** 2, axis=2), 0)
     pads = np.stack([np.ones(spread.shape), _PAD * np.sqrt(spread)], axis=2)
-    feet = np.concatenate([mean[..., :2], _LOAD * mass], axis=2)
+    feet = np.concatenate([mean[..., :2], LOAD * mass], axis=2)
     return solid._replace(vertices=vertices, feet=feet, pads=pads)
 
 
@@ -299,22 +300,25 @@ def support(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_feet(name: str, feet: ArrayLike, com: np.ndarray, at_most: int = 10_000) -> np.ndarray:
-    """Return feet (S, 4) [m, m, 1, 1]: x, y, weight and factor of friction, by default both 1.
+    """Return feet (S, 5) [m, m, 1, 1, m]: x, y, weight, factor of friction and radius of a pad.
 
-    The centre of mass is at `com` (2,) [m].
+    By default weight and factor are 1, and the radius is 0. The centre of mass is at `com` (2,)
+    [m]. Of pads with a radius, up to 16 are allowed.
 
     Raises:
       InputError: there are too few or too many, a weight or a factor is not positive, or the object
         tips over.
     """
-    points = errors.check_array(name, feet, ("S", 2), ("S", 3), ("S", 4))
+    points = errors.check_array(name, feet, *(("S", columns) for columns in range(2, 6)))
+    at_most = max(at_most, PADS) if points.shape[1] == 5 else at_most
     refuse = partial(errors.not_allowed, name, points.tolist())
     if not 3 <= len(points) <= at_most:
         rule = "x, y [m] and, if you like, a weight and a factor of friction"
         raise refuse(f"give 3 to {at_most} rows of {rule}")
-    points = np.pad(points, ((0, 0), (0, 4 - points.shape[1])), constant_values=1.0)
-    if (points[:, 2:] <= 0).any():
-        raise refuse("weights and factors of friction must be positive")
+    defaults = np.tile([0.0, 0.0, 1.0, 1.0, 0.0], (len(points), 1))
+    points = np.column_stack([points, defaults[:, points.shape[1] :]])
+    if (points[:, 2:4] <= 0).any() or (points[:, 4] < 0).any():
+        raise refuse("weights and factors of friction must be positive, and radii at least 0")
     in_line = np.linalg.matrix_rank(points[:, :2] - com) < 2
     if in_line or not np.all(encloses(points[:, :2], com)):
         raise refuse("the centre of mass must be between them, or it tips over")

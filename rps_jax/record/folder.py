@@ -128,6 +128,9 @@ def read_manifest(folder: Path) -> JsonObject:
     return files.read_checked_json(folder / MANIFEST)
 
 
+_ABSENT = {"drive": "omni"}  # values of fields that records of version 0.4 lack
+
+
 def describe_difference(stored: object, new: object) -> str:
     """Return the first three differences of two JSON values, in words.
 
@@ -144,7 +147,8 @@ def _differences(stored: object, new: object, path: str) -> Iterator[str]:
         if "file" not in new and files.suffix_of(str(stored.get("file"))) == ".npz":
             skipped = {"file", "digest"}  # of a policy that is shipped now; its class has a digest
         for key in (key for key in {**stored, **new} if key not in skipped):
-            pair = stored.get(key), new.get(key)
+            absent = _ABSENT.get(key)
+            pair = stored.get(key, absent), new.get(key, absent)
             yield from _differences(*pair, f"{path}.{key}" if path else key)
     elif stored != new:
         yield f"{path} = {_SHORT.repr(stored)} there, {_SHORT.repr(new)} asked for"

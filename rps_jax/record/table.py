@@ -143,7 +143,7 @@ class Table:
     """Known columns of a table.
 
     Args:
-      path: of the file.
+      source: file, or data frame.
       name: start of the sentence of errors.
       unit_of: the unit of a known name, which may be empty; None of all others.
       titles: titles in the file of some names, perhaps with a unit, as {"yaw": "heading [deg]"}.
@@ -152,10 +152,20 @@ class Table:
       InputError: the file is no table, or a column is repeated or has an unknown unit.
     """
 
-    def __init__(self, path: Path, name: str, unit_of: UnitOf, titles: Mapping[str, str]) -> None:
-        self._table, self._decimal = read(path, name)
+    def __init__(
+        self,
+        source: str | Path | pd.DataFrame,
+        name: str,
+        unit_of: UnitOf,
+        titles: Mapping[str, str] | None = None,
+    ) -> None:
+        is_frame = isinstance(source, pd.DataFrame)
+        self._table, self._decimal = (source, ".") if is_frame else read(Path(source), name)
+        if self._table.empty:
+            raise InputError(f"{name} is empty: give at least one row.")
         self.name, self.rows = name, self._table.index.to_numpy()
         self._titles = [str(title) for title in self._table.columns]
+        self._has_option, titles = titles is not None, titles or {}  # --columns
         self.columns = dict[str, tuple[int, str, float]]()  # index, unit, size of the file's unit
         self.conversions = list[str]()  # from other units, in words
         plain = [_split(title)[0] for title in self._titles]
@@ -171,7 +181,7 @@ class Table:
             title, unit, named = self._titles[i], unit_of(key) or "", titles.get(key, "")
             if key in self.columns:
                 pair = f"'{self._titles[self.columns[key][0]]}' and '{title}'"
-                fix = "remove all but one, or choose by --columns"
+                fix = "remove all but one" + ", or choose by --columns" * self._has_option
                 raise InputError(f"{name} has several columns for {key}, {pair}: {fix}.")
             suffix = named.rpartition("_")[2]
             suffix = suffix if _plain_unit(suffix) in _UNITS.get(unit, ()) else unit
@@ -195,7 +205,8 @@ class Table:
             noun = "columns" if len(missing) > 1 else "column"
             pairs = ",".join(f"{name}={similar[name]}" for name in missing)
             listing = textwrap.shorten(", ".join(unused) or "no other", 500, placeholder=" ...")
-            fix = f"add what is missing, or write --columns '{pairs}' with its titles, as {listing}"
+            fix = f", or write --columns '{pairs}' with its titles, as {listing}"
+            fix = "add what is missing" + fix * self._has_option
             raise InputError(f"{self.name} lacks the {noun} {', '.join(missing)}: {fix}.")
 
     def values_of(self, name: str, unused: np.ndarray | bool = False) -> np.ndarray:

@@ -176,10 +176,13 @@ class Shell:
             if first < -_ROUNDING or last > end + _ROUNDING:
                 rule = f"they leave the base, whose side ends at {end:g} m"
                 raise errors.not_allowed(field, f"{first:g} to {last:g} m", rule)
-            if (SIDES.index(boards.side), first + _ROUNDING) < previous:
-                rule = "they overlap the previous row, or are not in the order left, front, right"
+            side = SIDES.index(boards.side)
+            if (side, first + _ROUNDING) < previous:
+                rule = "write the rows in the order left, front, right"
+                if side == previous[0]:
+                    rule = f"they overlap the previous row, which ends at {previous[1]:g} m"
                 raise errors.not_allowed(field, f"{first:g} to {last:g} m", rule)
-            previous = SIDES.index(boards.side), last
+            previous = side, last
 
 
 def _span(row: Boards, side: Number) -> tuple[Number, Number]:

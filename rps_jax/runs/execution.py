@@ -56,7 +56,7 @@ def run_missing(
     """
     missing, finished = missing_chunks(folder, plan, shard)
     callback(Progress(finished, 0.0))
-    if missing:
+    if missing or not finished:  # a shard may have no trials
         slots = {"slots": size.get("slots")}  # on which the bits depend
         provenance.write_environment(folder, device.collect_environment() | slots)
 
@@ -100,7 +100,8 @@ def run_trials(
             return results.read_all([folder])
         chunks = shard_chunks(plan, shard)
         results.read(folder, set(chunks) & set(results.missing))
-        trials = np.unravel_index(np.concatenate(list(chunks.values())), results.shape)
+        no_trials = np.zeros(0, int)  # a small sweep has fewer chunks than shards
+        trials = np.unravel_index(np.concatenate([no_trials, *chunks.values()]), results.shape)
         law, world = (xr.DataArray(index, dims="row") for index in trials)
         return results.dataset().isel(law=law, world=world)
 

@@ -307,7 +307,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
         case, setting = self.case, self.setting
         trajectory = self.record(pushes.build([case], setting), setting, run)
         scene = pushes.scene_of(case, setting)
-        title = pushes.title_of(case, scene)
+        title = f"{pushes.title_of(case, scene)}, {registry.resolve_law(case.named_law)[0]}"
         named = {"scene": scene, "title": title, "engine": setting.engine}
         return Trace(**vars(trajectory), **named, attrs=self.attributes())
 

@@ -225,8 +225,8 @@ class Sweep(SweepOptions, PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQues
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         if "row" in results.dims:
-            text = f"When all shards are done: `rps merge {shlex.quote(str(self.out))} --out ...`."
-            return [Section(f"Shard {self.shard}", text)]
+            text = f"When all shards are done: `rps merge {shlex.quote(str(self.out))} --out ...`, "
+            return [Section(f"Shard {self.shard}", text + "with the run folder of each shard.")]
         sections = list(super().report(results, run))
         if "model_success" in results:
             text = (

@@ -131,6 +131,7 @@ class Setting:
     def check_domain(self, domain: Domain, laws: Iterable[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step the worlds of a domain with these laws."""
         self.simulator.check_surroundings(domain.surroundings)
+        self.simulator.check_pads(domain.has_pads, self.physics)
         self.check_here(domain.weakest, laws)
         for params in laws:
             registry.check_room(params, domain.task.kind, domain.task.free_room)

@@ -406,6 +406,7 @@ def decide(
     period, law = loop.physics.control_period, loop.law
     judged, measured, obs = perceive(world, params, trial, loop)
     state, twist, details = law.step(params, trial.law_state, obs)
+    twist = Twist(*twist)
     is_finite = functools.reduce(jnp.logical_and, map(jnp.isfinite, twist))
     judged = judged._replace(law_state=state, nan_twist=~judged.done & ~is_finite)
     time, reading = trial.steps * period, measured.reading

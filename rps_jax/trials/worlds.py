@@ -123,7 +123,7 @@ def build(indices: np.ndarray, inputs: WorldInputs, setting: Setting, **fields: 
     engine, dtype = setting.simulator, jnp.result_type(float)
     engine.check_robot(inputs.robots)
     inputs = inputs.supported
-    engine.check_pads(inputs.solids, setting.physics)
+    engine.check_pads(inputs.solids.pads is not None, setting.physics)
     added = getattr(fields.get("task"), "surroundings", None) or {}
     inputs = inputs._replace(surroundings=inputs.surroundings._replace(**added))
     engine.check_surroundings(inputs.surroundings)

@@ -11,6 +11,7 @@ direction of a push corrects what the fitted pushes leave nearby.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,7 +28,6 @@ from scipy.optimize import least_squares
 from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.engines import finger
-from rps_jax.errors import InputError
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry.arrays import Pair
 from rps_jax.record.options import option
@@ -111,17 +111,10 @@ def read_pushes(pushes: PushesLike) -> Pushes:
     """
     if isinstance(pushes, Pushes):
         return pushes
-    if isinstance(pushes, pd.DataFrame):
-        if missing := [x for x in _COLUMNS if x not in pushes]:
-            raise InputError(f"pushes lack the column {missing[0]}: give {', '.join(_COLUMNS)}.")
-        columns = {name: np.asarray(pushes[name], float) for name in _COLUMNS}
-    else:
-        table = Table(Path(pushes), f"pushes = {pushes}", _COLUMNS.get, {})
-        table.require(_COLUMNS)
-        columns = {name: table.values_of(name) for name in _COLUMNS}
-    rows = np.column_stack(list(columns.values()))
-    if not len(rows) or not np.isfinite(rows).all():
-        raise errors.not_allowed("pushes", "a table with gaps", "give finite numbers, m and rad")
+    name = "pushes" if isinstance(pushes, pd.DataFrame) else f"pushes = {pushes}"
+    table = Table(pushes, name, _COLUMNS.get)
+    table.require(_COLUMNS)
+    rows = np.column_stack([table.values_of(name) for name in _COLUMNS])
     if abs(rows[:, [2, 3, 5, 6]]).max() > 50 or abs(rows[:, 4]).max() > 50:
         largest = f"numbers up to {abs(rows[:, 2:]).max():.3g}"
         raise errors.not_allowed("pushes", largest, "give x and y in m and yaw in rad")
@@ -466,13 +459,22 @@ class FitObject(Question[ObjectFit]):
     prior: Any = option(None, kw_only=True, hidden=True)
     """Priors (mean, standard deviation) of parameters by name, in Python; by default `PRIOR`."""
 
-    def answer(self, run: Run) -> ObjectFit:
+    @functools.cached_property
+    def _inputs(self) -> tuple[np.ndarray, Pushes]:
+        """Outline and pushes, read from their tables."""
         outline = self.outline
         if isinstance(outline, str | Path):
-            table = Table(Path(outline), f"outline = {outline}", {"x": "m", "y": "m"}.get, {})
+            table = Table(outline, f"outline = {outline}", {"x": "m", "y": "m"}.get)
             table.require(("x", "y"))
             outline = np.column_stack([table.values_of("x"), table.values_of("y")])
-        return fit(outline, self.pushes, self.radius, self.prior or PRIOR, self.feet)
+        return finger.check_outline(outline), read_pushes(self.pushes)
+
+    def check(self) -> None:
+        super().check()
+        _ = self._inputs
+
+    def answer(self, run: Run) -> ObjectFit:
+        return fit(*self._inputs, self.radius, self.prior or PRIOR, self.feet)
 
     def report(self, results: ObjectFit, run: Run) -> Sequence[Section]:
         data = results.data
@@ -480,10 +482,13 @@ class FitObject(Question[ObjectFit]):
         for name in PRIOR:
             row, unit = data.sel(parameter=name), _OFFSETS.get(name, "1")
             rows.append([name, unit, f"{float(row['mean']):.4g}", f"{float(row.deviation):.2g}"])
-        gap = 1e3 * float(abs(data.gap).median())
+        gap, feet = 1e3 * float(abs(data.gap).median()), results.feet
+        x, y = 1e3 * feet[:, 2] @ feet[:, :2]
         text = (
-            f"The friction between object and finger is {results.friction:.2f}. "
-            f"{results.misplaced} The gap at the end of the pushes is {gap:.2f} mm (median)."
+            f"The friction between object and finger is {results.friction:.2f}. The object's "
+            f"weight acts at ({x:.1f}, {y:.1f}) mm: give its file this centre of mass. "
+            f"{results.misplaced} The gap at the end of the pushes is {gap:.2f} mm (median). "
+            "The parameters ring to quatrefoil_y shape the logarithm of the pressure."
         )
         return [Section("Parameters", text, rows)]
 

@@ -25,6 +25,7 @@ from rps_jax.world.objects import (
     PAPER_OBJECTS,
     check_object,
     custom_solids,
+    is_on_pads,
     parse_object,
     text_of,
 )
@@ -348,6 +349,11 @@ class Domain:
         names = [(FAMILIES | RANDOM)[name] for name in self.objects]
         on_feet = (self.feet, self.support, self.boundary_factor) != (None, None, None)
         return tuple("prism" if on_feet and name == "box" else name for name in names)
+
+    @property
+    def has_pads(self) -> bool:
+        """Whether objects stand on pads, or on feet with weights."""
+        return self.support is not None or any(map(is_on_pads, self.objects))
 
     def family_of(self, index: int) -> str:
         """Return the shape family of the object of one world."""

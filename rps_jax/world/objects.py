@@ -143,6 +143,11 @@ def check_object(kind: str, name: str, *more: str) -> str:
     return errors.check_name(kind, name, known, "FILE.xml")
 
 
+def is_on_pads(name: str) -> bool:
+    """Return whether a custom object stands on pads, or on feet with weights."""
+    return name in REGISTERED and REGISTERED[name].solid.pads is not None
+
+
 def text_of(name: str) -> str:
     """Return the text from which another process parses an object: its file, or its name."""
     custom = REGISTERED.get(name)
@@ -212,8 +217,10 @@ def register_object(
         It reaches from that geom to the convex hull of all geoms, within 2 %.
       feet: positions (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, also with
         weights (S, 3) [m, m, 1], as of springs that share the load, and with factors of friction
-        with the ground (S, 4) [m, m, 1, 1], as 0.02 of a castor. By default it has the support of
-        the physics: its corners or its rim, or even pressure with `physics=default,support=even`.
+        with the ground (S, 4) [m, m, 1, 1], as 0.02 of a castor; or up to 16 pads (S, 5), whose
+        last column is their radius [m], as `fit_object` gives them. Weights are loads if the centre
+        of mass is at their mean. By default it has the support of the physics: its corners or its
+        rim, or even pressure with `physics=default,support=even`.
 
     Raises:
       InputError: the name is one of the paper's, or file, footprint or feet are invalid.
@@ -254,11 +261,12 @@ def register_object(
     if feet is not None:
         family, vertices = "cylinder" if radius else "prism", solid.padded(vertices)
         feet = solid.check_feet(f"{label}: feet", feet, body.ipos[:2], at_most=SIDES)
-        missing = np.repeat(feet[-1:] * [1, 1, 0, 1], SIDES - len(feet), axis=0)
+        size = SIDES if len(feet) <= SIDES else solid.PADS
+        missing = np.repeat(feet[-1:] * [1, 1, 0, 1, 0], size - len(feet), axis=0)
         rows, equal = np.concatenate([feet, missing]), np.ptp(feet[:, 2]) == 0
-        if not equal or np.any(feet[:, 3] != 1):  # a mean weight of 1
-            rows[:, 2] /= feet[:, 2].mean()
-            pads = np.column_stack([rows[:, 3], np.zeros(SIDES)])
+        if not equal or np.any(feet[:, 3:] != [1, 0]):  # points have a mean weight of 1
+            rows[:, 2] /= feet[:, 2].mean() * (len(feet) / solid.LOAD if feet[:, 4].any() else 1)
+            pads = rows[:, 3:]
         feet = rows[:, :3]
     single = solid_of_body(body, vertices, radius, _height(label, model))
     REGISTERED[name] = Registered(path, single._replace(feet=feet, pads=pads))

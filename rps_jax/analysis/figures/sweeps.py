@@ -63,6 +63,8 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
         if unordered:
             counts = np.unique(values)
             ax.set_xticks(counts, [f"{n:g}" if n else "round" for n in counts])
+        else:
+            ax.locator_params(axis="x", nbins=5)
         ax.set_xlabel(axis_label(influence.name, values.attrs["units"]))
         chance = " (may be chance)" * _is_flat(influence)
         ax.set_title(f"spread {_spread(influence)}, q = {influence.q:.1g}{chance}")

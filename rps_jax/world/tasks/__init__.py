@@ -64,7 +64,12 @@ _SUBJECTS = {1: "the base ", 2: "the object "}
 
 # For errors: of ranges, of types, and of tuples of tuples by their sizes.
 _RANGE = "a number, or low and high as [0.3, 0.6]"
-_FORMS = {bool: "true or false", int: "a whole number", 2: "pairs of x, y [m]", 3: "x, y, yaw"}
+_FORMS = {
+    bool: "true or false",
+    int: "a whole number",
+    2: "pairs of x, y [m], without a heading",
+    3: "x, y, yaw",
+}
 
 
 def _stored(name: str, task: Any) -> JsonObject:
