@@ -330,7 +330,7 @@ test_bad_options_are_refused_before_anything_compiles = refusals(
 def test_the_former_flags_say_where_random_steps_are(capsys):
     for flag in ("--starts", "--spread"):
         text = refusal(capsys, f"tune grad {flag} 2")
-        assert f"unknown option '{flag}'" in text
+        assert f"the option {flag[2:]} has been removed" in text
         assert "`rps tune es --estimator antithetic`" in text
 
 

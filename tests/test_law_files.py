@@ -130,7 +130,7 @@ def test_shadow_counts_twists_that_are_not_finite(tmp_path):
     results = xr.Dataset(
         {k: (("source", "time"), both[..., i]) for i, k in enumerate(("v_x", "v_y", "omega"))},
         {"source": ["commanded", "law"], "time": recorded["time"]},
-        {"law": "mine", "doubts": ""},
+        {"law": "mine"},
     )
     question = Shadow("a.mcap", str(path))
     (section,) = question.report(results, question.create_run(None, lambda progress: None))

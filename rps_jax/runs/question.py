@@ -102,8 +102,15 @@ def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
 
 
 def current_names(command: object, values: Mapping[str, T]) -> dict[str, T]:
-    """Return values by the present names of fields of a command; warn of former names."""
+    """Return values by the present names of fields of a command; warn of former names.
+
+    Raises:
+      InputError: a field has been removed.
+    """
     current = dict(values)
+    for removed, instead in getattr(command, "REMOVED", {}).items():
+        if removed in current:
+            raise errors.InputError(f"the option {removed} has been removed: {instead}.")
     for former, name in getattr(command, "RENAMED", {}).items():
         if former in current:
             text = f"{former} of {snake_case(command.__name__)} will be removed: write {name}"
@@ -129,7 +136,7 @@ class Command(Generic[T]):
     """Callback that receives the progress instead of a bar."""
 
     QUICK: ClassVar[Mapping[str, object]] = {}  # values of `quick`, by the field's name
-    MOVED: ClassVar[Mapping[str, str]] = {}  # what replaces a former flag, by the flag
+    REMOVED: ClassVar[Mapping[str, str]] = {}  # what to do instead of former options, by name
     RENAMED: ClassVar[Mapping[str, str]] = {}  # present names of fields by their former ones
     # Fields of a class on which the answer does not depend, beside those of its base classes.
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("out", "progress", "report_to")
@@ -352,8 +359,8 @@ class BagQuestion(Question[T]):
 
     topics: TopicsLike = option((), flag="topic")
     """Topic of a bag that has another name, as odom=/ridgeback/odom; the option may be repeated.
-    The keys are odom, target, path, contact, taxels, force, object, cmd_vel, tf and tf_static. In
-    Python a dict: topics={"odom": "/ridgeback/odom"}."""
+    The keys are odom, target, path, contact, taxels, force, object and cmd_vel. In Python a dict:
+    topics={"odom": "/ridgeback/odom"}."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from matplotlib.artist import setp
 from scipy import stats
 
 from rps_jax import errors
-from rps_jax.analysis import mechanisms, statistics, tables
+from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.paper import draw_path
 from rps_jax.analysis.figures.style import WIDTH, Figure, styled, tiles
 from rps_jax.questions import Picture, Plan, Run, Section, call_of, option
@@ -122,7 +122,7 @@ class Gallery(Question[xr.Dataset]):
 
     def intro(self, results: xr.Dataset) -> str:
         maps = "The maps show the outlines of base and object at the start (pale) and at the end."
-        return f"Run {self.run}: failure modes. {maps} {mechanisms.THRESHOLDS}"
+        return f"Run {self.run}: failure modes. {maps}"
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         plan, law = self.plan_and_law
@@ -140,7 +140,7 @@ class Gallery(Question[xr.Dataset]):
             title = f"{law}: {mode}, {len(plotted)} of {indices.size} in {size} worlds"
             text = _text(self.run, law, results, indices)
             picture = Picture(mode.replace(" ", "_"), partial(maps_figure, plotted, title))
-            rows = mechanism_table(plotted)
+            rows = trials_table(plotted)
             sections.append(Section(f"{mode}: {indices.size} of {size}", text, rows, picture))
         return sections
 
@@ -164,7 +164,7 @@ def _simulate(
 ) -> Mapping[int, xr.Dataset]:
     """Return traces of trials of a law over time, by world; one batch for each object.
 
-    The attribute `differs` says whether a trial ends otherwise than in the sweep.
+    A warning names a trial that ends otherwise than in the sweep.
     """
     traces: dict[int, xr.Dataset] = {}
     objects = plan.object_of(worlds)
@@ -175,20 +175,17 @@ def _simulate(
         trajectories = pushes.record_batch(batch, plan.setting, **options)
         progress.finish(rows.size)
         outcomes = jax.tree.map(lambda *x: np.stack(x), *(x.outcome for x in trajectories))
-        differ = find_differences(run, law, rows.tolist(), outcomes)
-        for i, trajectory, differs in zip(rows.tolist(), trajectories, differ, strict=True):
-            traces[i] = trace_dataset(trajectory).assign_attrs(differs=bool(differs))
+        find_differences(run, law, rows.tolist(), outcomes)
+        traces |= dict(zip(rows.tolist(), map(trace_dataset, trajectories), strict=True))
     return traces
 
 
-def mechanism_table(traces: Mapping[int, xr.Dataset]) -> Rows:
-    """Return a row for the trace of each world: its end, and the mechanisms measured in it."""
-    rows = [["world", "end", "least distance", "path of the base", "measured"]]
+def trials_table(traces: Mapping[int, xr.Dataset]) -> Rows:
+    """Return a row for the trace of each world: its end, and the path of the base."""
+    rows = [["world", "end", "least distance", "path of the base"]]
     for world, trace in traces.items():
-        text = "ends otherwise than in the sweep; " * trace.attrs.get("differs", False)
-        text += mechanisms.describe(trace)
         end, path = float(trace.outcome_time), float(trace.outcome_path_length)
-        rows.append([str(world), f"{end:.0f} s", _miss(trace), f"{path:.1f} m", text or "-"])
+        rows.append([str(world), f"{end:.0f} s", _miss(trace), f"{path:.1f} m"])
     return rows
 
 

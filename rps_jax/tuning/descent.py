@@ -92,8 +92,8 @@ class TuneGrad(Descent):
         "window_steps": 4,
     }  # fmt: skip
 
-    MOVED: ClassVar = dict.fromkeys(
-        ("--starts", "--spread"),
+    REMOVED: ClassVar = dict.fromkeys(
+        ("starts", "spread"),
         "rps tune grad follows derivatives; the former random steps, from one start, are "
         "`rps tune es --estimator antithetic`",
     )

@@ -27,11 +27,10 @@ from scipy.optimize import least_squares
 from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.engines import finger
-from rps_jax.errors import InputError
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry.arrays import Pair
+from rps_jax.record import table
 from rps_jax.record.options import option
-from rps_jax.record.table import Table
 from rps_jax.runs.question import Question, Rows, Run, call_of
 
 # Priors (mean, standard deviation) of the parameters; pressures are logarithms per unit of the
@@ -111,15 +110,10 @@ def read_pushes(pushes: PushesLike) -> Pushes:
     """
     if isinstance(pushes, Pushes):
         return pushes
-    if isinstance(pushes, pd.DataFrame):
-        if missing := [x for x in _COLUMNS if x not in pushes]:
-            raise InputError(f"pushes lack the column {missing[0]}: give {', '.join(_COLUMNS)}.")
-        columns = {name: np.asarray(pushes[name], float) for name in _COLUMNS}
-    else:
-        table = Table(Path(pushes), f"pushes = {pushes}", _COLUMNS.get, {})
-        table.require(_COLUMNS)
-        columns = {name: table.values_of(name) for name in _COLUMNS}
-    rows = np.column_stack(list(columns.values()))
+    if not isinstance(pushes, pd.DataFrame):
+        pushes = table.read(Path(pushes), f"pushes = {pushes}", _COLUMNS.get)
+    table.require(pushes, "the table of pushes", _COLUMNS)
+    rows = pushes[list(_COLUMNS)].to_numpy(float)
     if not len(rows) or not np.isfinite(rows).all():
         raise errors.not_allowed("pushes", "a table with gaps", "give finite numbers, m and rad")
     if abs(rows[:, [2, 3, 5, 6]]).max() > 50 or abs(rows[:, 4]).max() > 50:
@@ -469,9 +463,10 @@ class FitObject(Question[ObjectFit]):
     def answer(self, run: Run) -> ObjectFit:
         outline = self.outline
         if isinstance(outline, str | Path):
-            table = Table(Path(outline), f"outline = {outline}", {"x": "m", "y": "m"}.get, {})
-            table.require(("x", "y"))
-            outline = np.column_stack([table.values_of("x"), table.values_of("y")])
+            name = f"outline = {outline}"
+            corners = table.read(Path(outline), name, {"x": "m", "y": "m"}.get)
+            table.require(corners, name, ("x", "y"))
+            outline = corners[["x", "y"]].to_numpy(float)
         return fit(outline, self.pushes, self.radius, self.prior or PRIOR, self.feet)
 
     def report(self, results: ObjectFit, run: Run) -> Sequence[Section]:
