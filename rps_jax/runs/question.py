@@ -56,7 +56,6 @@ from rps_jax.robot.robot import RobotLike, parse_robot
 from rps_jax.runs.run import Run
 from rps_jax.trials.progress import Bar, ProgressCallback, is_interactive
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import (
     Domain,
@@ -376,7 +375,8 @@ class QuickQuestion(Question[T]):
         return quick_command(self, self) if self.quick else self
 
     def quick_note(self) -> str:
-        return quick_note(self) if self.quick else ""
+        text = "**This is a quick run**, which tests that the command works here: omit --quick."
+        return text * bool(self.quick and self.quick_values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -512,29 +512,6 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
 
 
 # --- small helpers of reports --------------------------------------------------------------
-
-
-def quick_note(question: Question[object]) -> str:
-    """Return the first line of the report of a quick run, or nothing if it has no quick values."""
-    names = question.quick_values()
-    values = (_value_in_words(name, attrgetter(name)(question)) for name in names)
-    if not names:
-        return ""
-    return (
-        f"**This is a quick run** ({'; '.join(values)}). It tests that the command works here; "
-        "for results leave out --quick."
-    )
-
-
-def _value_in_words(name: str, value: object) -> str:
-    """Return the name and the value of an option in words; of rules those that are changed."""
-    if isinstance(value, Rules):
-        defaults, values = Rules._field_defaults, value._asdict()
-        changed = {key: item for key, item in values.items() if item != defaults[key]}
-        return "; ".join(itertools.starmap(_value_in_words, changed.items()))
-    items = value if isinstance(value, tuple | list) else [value]
-    words = (name_or_custom(x) if isinstance(x, Domain) else str(x) for x in items)
-    return f"{name.rpartition('.')[2].replace('_', ' ')} {', '.join(words)}"
 
 
 def count_true(mask: np.ndarray) -> int:
