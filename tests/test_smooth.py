@@ -442,8 +442,8 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     """The push starts before the first touch and turns towards a target at the side."""
     start = case((1.0, -1.5), name, gap=0.005)
     cold = replace(start, skin=CapacitiveSkin(temperature=1e-6))
-    exact = push(replace(start, skin=CapacitiveSkin()), rps.LAW, 10.0)
-    got = push(cold, registry.smooth_law(rps.LAW, COLD), 10.0)
+    exact = push(replace(start, skin=CapacitiveSkin()), rps.LAW, 5.0)
+    got = push(cold, registry.smooth_law(rps.LAW, COLD), 5.0)
     assert abs(exact.qpos[2]) > 0.2  # it turned
     assert_allclose(got.qpos, exact.qpos, atol=2e-3)
     assert got.contact_steps == pytest.approx(exact.contact_steps, abs=1)
