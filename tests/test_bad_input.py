@@ -228,7 +228,7 @@ COMMANDS = {
     },
     "regress --laws rps": {"--against best": "unknown against 'best': choose from rps, "},
     "export c --law rps": {"--skin ideal": "name one with taxels", "--prefix 2": "prefix = 2 is"},
-    "shadow": {"none.mcap": "give an MCAP file"},
+    "shadow": {"none.mcap": "give FILE.mcap"},
     "fit": {"none.csv": "none.csv cannot be read"},
     "puhs": {"": "puhs"},
 }
