@@ -99,6 +99,7 @@ CASES: dict[str, Case] = {
     "blank lines": Case(lines(lambda rows: ["", *rows[:50], "", *rows[50:]])),
     "comments": Case(lines(lambda rows: ["# of robot 3", *rows[:9], "# a;b", *rows[9:]])),
     "additional columns": Case(text(lambda t: t.assign(note="a, b", battery=np.nan))),
+    "title of two lines": Case(text(lambda t: t.assign(**{"a\nnote": 1.0}))),
     "capitals": Case(text(CAPITALS)),
     "surrounding blanks": Case(lines(lambda rows: [r.replace(",", " , ") for r in rows])),
     "another suffix": Case(text(), "give a trace, a run folder of rps push, a", suffix=".json"),

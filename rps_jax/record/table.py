@@ -57,12 +57,13 @@ def read(path: Path, name: str, unit_of: Callable[[str], str | None]) -> pd.Data
     columns = dict[str, pd.Series]()
     titles = [str(title) for title in cells.iloc[0]]
     for i, title in enumerate(titles):
-        key, unit = _TITLE.fullmatch(title.casefold()).groups()
+        match = _TITLE.fullmatch(title.casefold())
+        key, unit = match.groups() if match else (title, None)
         if (expected := unit_of(key := re.sub(r"[\s.-]+", "_", key))) is None:
             continue
         if key in columns:
             raise InputError(f"{name} has several columns for {key}: remove all but one.")
-        columns[key] = pd.to_numeric(cells[i][1:], errors="coerce")
+        columns[key] = pd.Series(pd.to_numeric(cells[i][1:], errors="coerce"))
         if unit and expected:
             kind = f"unit of the column '{title}' in {name}:"
             columns[key] *= _UNITS[expected][check_name(kind, unit, _UNITS[expected])]

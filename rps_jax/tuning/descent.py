@@ -92,7 +92,7 @@ class TuneGrad(Descent):
         "window_steps": 4,
     }  # fmt: skip
 
-    REMOVED: ClassVar = Tuning.REMOVED | dict.fromkeys(
+    REMOVED: ClassVar = dict(Tuning.REMOVED) | dict.fromkeys(
         ("starts", "spread"),
         "rps tune grad follows derivatives; the former random steps, from one start, are "
         "`rps tune es --estimator antithetic`",

@@ -213,7 +213,7 @@ def way_around(
 ) -> Way:
     """Compute D6: the point that the base drives to, on its way to the staging point."""
     phi, turn, side = turn_around(psi, offset, side, chooses)
-    is_direct = ahead > turn
+    is_direct = turn < ahead
     staging = middle - distance * planar.unit(psi)
     carrot = middle + radius * planar.unit(phi + side * ahead)
     return Way(side, is_direct, staging, jnp.where(is_direct, staging, carrot))
