@@ -128,5 +128,5 @@ table = results.drop_dims("pose").to_dataframe().reset_index()
 table[["law", "world", "success", "time", "mass", "size", "com_offset"]].head()
 
 # %% [markdown]
-# `rps sweep --table results.csv` (or `.parquet`) writes this table, with one row for each law and
-# world and a file with the units. `results.nc` is a NetCDF file that MATLAB, R and Julia read.
+# `table.to_csv("results.csv")` writes it. `results.nc` is a NetCDF file that MATLAB, R and Julia
+# read, with the units.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import io
-import math
 import random
 import sqlite3
 import struct
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import zstandard
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
@@ -33,7 +31,6 @@ from rps_jax.record.bag import Step
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 COUNT = 40
 KINDS = bag.TOPICS | {
-    "/tf_static": "tf2_msgs/TFMessage",
     "/plain": "geometry_msgs/Twist",
     "/pose": "geometry_msgs/PoseStamped",
 }
@@ -165,35 +162,6 @@ def framed(topic: str, frame: str, source: Iterable[Row] | None = None) -> list[
     return edited(topic, set_("header.frame_id", frame), source=source)
 
 
-def moved(topic: str, x: float, y: float, frame: str, field: str = "point") -> list[Row]:
-    """Return rows with a point in another frame, shifted."""
-
-    def edit(message: dict[str, Any]) -> None:
-        message["header"] = message["header"] | {"frame_id": frame}
-        owner = message["polygon"] if field == "points" else message
-        points = owner["points"] if field == "points" else [owner[field]]
-        shifted = [{"x": p["x"] + x, "y": p["y"] + y, "z": 0.0} for p in points]
-        owner[field] = shifted if field == "points" else shifted[0]
-
-    return edited(topic, edit)
-
-
-def transform(
-    parent: str,
-    child: str,
-    x: float,
-    y: float,
-    yaw: float = 0.0,
-    topic: str = "/tf_static",
-    stamp: int = 0,
-) -> Row:
-    frame = bag._frame(bag._header(stamp, parent), child, x, y, yaw)
-    return Row(topic, max(stamp, SECOND), {"transforms": [frame]})
-
-
-# --- files ---------------------------------------------------------------------------------
-
-
 def encode(messages: Iterable[Row], kinds: Mapping[str, str] = KINDS) -> list[Record]:
     """Return messages as bytes, in their order."""
     file, schemas, messages = io.BytesIO(), {}, list(messages)
@@ -282,7 +250,7 @@ def folder_of(plugin: str = "MCAP", compression: str = "NONE", parts: int = 1) -
             )
             assert names[1] in text
             (first / "metadata.yaml").write_text(text)
-        return first.rename(folder / "push#1 ?")
+        return first.rename(folder / "one push")
 
     return write
 
@@ -325,18 +293,6 @@ def flipped(folder: Path) -> Path:
     return path
 
 
-def chunked(data: bytes, size: int, compression: str) -> bytes:
-    """Return an MCAP file with one chunk."""
-
-    def record(opcode: int, body: bytes) -> bytes:
-        return struct.pack("<BQ", opcode, len(body)) + body
-
-    header = record(1, struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 0))
-    start = struct.pack("<QQQII", 0, 0, size, 0, len(compression)) + compression.encode()
-    magic = b"\x89MCAP0\r\n"
-    return magic + header + record(6, start + struct.pack("<Q", len(data)) + data) + magic
-
-
 def old_sqlite(folder: Path) -> Path:
     """Write a bag as the first releases of ROS 2 did, without definitions."""
     path = file_of(folder_of("SQLITE3"))(folder)
@@ -375,34 +331,9 @@ def ros1_bag(folder: Path) -> Path:
     return folder / "push.bag"
 
 
-def ros1_records() -> list[Record]:
-    store = get_typestore(Stores.ROS1_NOETIC)
-    return [
-        r._replace(
-            kind=r.kind.replace("/msg/", "/"),
-            text=store.generate_msgdef(r.kind)[0],
-            data=bytes(STORE.cdr_to_ros1(r.data, r.kind)),
-        )
-        for r in encode(without("/object", "/target_marker", "/tf"))
-    ]
-
-
-def big_endian(record: Record) -> Record:
-    message = STORE.deserialize_cdr(record.data, record.kind)
-    data = STORE.serialize_cdr(message, record.kind, little_endian=False)
-    return record._replace(data=bytes(data))
-
-
 def changed(change: Callable[[Record], Record]) -> Writer:
     """Return what writes an MCAP file with changed records."""
     return lambda folder: mcap(map(change, encode(rows())))(folder)
-
-
-def several(folder: Path) -> Path:
-    """Write a folder of two bags without metadata."""
-    for name in ("push/a.mcap", "push/b.mcap"):
-        plain(rows(), name=name)(folder)
-    return folder / "push"
 
 
 def changed_folder(change: Callable[[Path], object], parts: int = 1) -> Writer:
@@ -440,16 +371,6 @@ def as_pose(source: Iterable[Row]) -> list[Row]:
     ]
 
 
-def base_target() -> list[Row]:
-    """Return rows whose target is in the frame of the base, once, at the third step."""
-    x, y, yaw = push()[2].pose
-    c, s, dx, dy = math.cos(yaw), math.sin(yaw), 6.0 - x, 2.0 - y
-    point = {"x": c * dx + s * dy, "y": c * dy - s * dx}
-    (row,) = [row for row in rows() if row.topic == "/target"][2:3]
-    message = {"header": row.message["header"] | {"frame_id": "base_link"}, "point": point}
-    return [row._replace(time=SECOND, message=message), *without("/target")]
-
-
 def prefixed() -> list[Row]:
     """Return rows with a prefix of all frames."""
     result = edited("/odom", set_("child_frame_id", "r1/base_link"))
@@ -469,28 +390,6 @@ def on_path(paths: Mapping[int, Sequence[tuple[float, float]]], *left_out: str) 
     return result
 
 
-def moving_map() -> list[Row]:
-    """Return rows with a target in a map that moves against odom by 1 m in a step."""
-
-    def edit(i: int) -> Callable[[dict[str, Any]], None]:
-        return lambda m: m.update(
-            header=m["header"] | {"frame_id": "map"}, point={"x": 6.0 + 2 * i, "y": 2.0}
-        )
-
-    result = rows()
-    for i in range(COUNT):
-        result = edited("/target", edit(i), [i], result)
-        stamp = round(1e9 * push()[i].time)
-        result.append(transform("map", "odom", 2.0 * i, 0.0, topic="/tf", stamp=stamp))
-    return result
-
-
-STATIC = {
-    "map": transform("map", "odom", 2.0, -1.0),
-    "skin": transform("base_link", "skin", 0.25, 0.5),
-    "same": transform("base_footprint", "base_link", 0.0, 0.0),
-    "turned": transform("base_link", "turned", 0.0, 0.0, math.pi / 2),
-}
 NO_INDEX = {
     "index_types": IndexType.NONE,
     "use_statistics": False,
@@ -503,12 +402,6 @@ LINE = ((0.0, 0.0), (3.0, 1.0), (6.0, 2.0))  # [m] a path
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
 STAMPED = ("/odom", "/target", "/object", "/contact", "/force", "/cmd_vel")
 NAN = float("nan")
-
-
-def turned_force(message: dict[str, Any]) -> None:
-    x, y = message["wrench"]["force"]["x"], message["wrench"]["force"]["y"]
-    message["header"] = message["header"] | {"frame_id": "turned"}
-    message["wrench"] = {"force": {"x": y, "y": -x}}
 
 
 def cases() -> list[Case]:
@@ -541,8 +434,10 @@ def _order() -> dict[str, tuple[Any, ...]]:
         "shuffled, small chunks": (
             plain(random.Random(3).sample(whole, len(whole)), chunk_size=500),
         ),
-        "a receipt back by 5 s": (received(lambda r, _: r.time - 5 * SECOND, "/odom", [9]),),
-        "a receipt ahead by an hour": (received(lambda r, _: r.time + hour, "/cmd_vel", [9]),),
+        "a receipt ahead by an hour": (
+            received(lambda r, _: r.time + hour, "/cmd_vel", [9]),
+            "a header stamp that goes back",
+        ),
         "receipts repeated": (received(lambda r, i: SECOND + i // 2 * 40 * MS, "/cmd_vel"),),
         "receipts late by 80 ms": (received(lambda r, _: r.time + 80 * MS),),
         "receipts by another clock": (received(lambda r, _: r.time + late),),
@@ -588,8 +483,7 @@ def _order() -> dict[str, tuple[Any, ...]]:
         "a simulation that pauses, and then is slower": (
             received(lambda r, _: r.time if r.time < 1400 * MS else 3 * r.time + hour),
         ),
-        "receipts by two clocks": (by_two, "no header stamp, nor times of receipt"),
-        "receipts by two clocks, of taxels that a law does not sense": (by_two, "", (), 0.0, TOUCH),
+        "receipts by two clocks": (by_two, "a header stamp that goes back"),
         "an object of another clock, which a law does not sense": (
             stamped(lambda t: t + late, ["/object"]),
             "",
@@ -619,22 +513,9 @@ def _formats() -> dict[str, tuple[Any, ...]]:
         "MCAP with lz4": (plain(whole, compression=CompressionType.LZ4),),
         "MCAP without chunks and summary": (plain(whole, use_chunking=False, **NO_INDEX),),
         "MCAP without checksums": (plain(whole, enable_crcs=False),),
-        "suffix .txt": (plain(whole, name="bag.txt"),),
         "schemas without text and language": (plain(whole, schema="", text=lambda r: ""),),
         "types without msg": (changed(lambda r: r._replace(kind=r.kind.replace("/msg/", "/"))),),
-        "big endian": (changed(big_endian),),
-        "messages compressed in an MCAP file": (
-            changed(lambda r: r._replace(data=zstandard.compress(r.data))),
-        ),
-        "messages of ROS 1 in MCAP": (
-            lambda f: mcap(ros1_records(), schema="ros1msg", encoding="ros1", profile="ros1")(f),
-        ),
-        "folder without metadata": (changed_folder(lambda p: (p / "metadata.yaml").unlink()),),
-        "a file .mcap.zstd": (file_of(folder_of("MCAP", "FILE")),),
-        "a file .db3.zstd": (file_of(folder_of("SQLITE3", "FILE")),),
         "a file .db3": (file_of(folder_of("SQLITE3")),),
-        "a file .db3 named .mcap": (file_of(folder_of("SQLITE3"), "push.mcap"),),
-        "a file .db3, messages compressed": (file_of(folder_of("SQLITE3", "MESSAGE")),),
         "a file .db3 without definitions": (old_sqlite,),
         "other topics of unknown types": (
             lambda f: mcap([*encode(whole), Record("/raw", "x/msg/Y", "~?", SECOND, b"?")])(f),
@@ -646,65 +527,48 @@ def _invalid_files() -> dict[str, tuple[Any, ...]]:
     """Return files that are no bags, or damaged."""
     whole = rows()
     return {
-        "an empty file": (content(b""), "is no bag of ROS 2): give FILE.mcap"),
+        "an empty file": (content(b""), "seems to be empty): give FILE.mcap"),
         "a pointer of Git LFS": (content(POINTER), "fetch the file itself by `git lfs pull`"),
         "a folder of pointers of Git LFS": (
             changed_folder(lambda p: (p / "push 0.mcap").write_bytes(POINTER)),
             "`git lfs pull`",
         ),
-        "a path that is missing": (lambda f: f / "none.mcap", "No such file"),
-        "a cut MCAP file": (cut(plain(whole), 0.5), "is cut off or damaged, save the rest"),
-        "an MCAP file without end": (cut(plain(whole, **NO_INDEX), 0.99), "is cut off"),
-        "a wrong bit": (flipped, "cannot be read (crc validation failed"),
-        "a cut file .db3": (cut(file_of(folder_of("SQLITE3")), 0.5), ".recover | sqlite3"),
-        "a cut file .mcap.zstd": (cut(file_of(folder_of("MCAP", "FILE")), 0.5), "compress it"),
-        "zstd of no bag": (content(zstandard.compress(b"no"), "a.zstd"), "is no bag of ROS 2"),
-        "another sqlite3 file": (other_sqlite, "no such table: topics"),
-        "ROS 1": (ros1_bag, "convert this ROS 1 bag by `rosbags-convert --src"),
+        "a path that is missing": (lambda f: f / "none.mcap", "does not exist"),
+        "a cut MCAP file": (cut(plain(whole), 0.5), "cannot be read"),
+        "an MCAP file without end": (cut(plain(whole, **NO_INDEX), 0.99), "cannot be read"),
+        "a wrong bit": (flipped, "Chunk checksum mismatch"),
+        "a cut file .db3": (cut(file_of(folder_of("SQLITE3")), 0.5), "cannot be read"),
+        "another suffix": (content(b"", "a.zstd"), "Unrecognized storage format"),
+        "another sqlite3 file": (other_sqlite, "cannot be read"),
+        "ROS 1": (ros1_bag, "`rosbags-convert` converts bags of ROS 1"),
         "messages in protobuf": (
             plain(whole, encoding="protobuf", schema="protobuf"),
-            "in the encoding protobuf",
+            "cannot be read",
         ),
         "messages of odd bytes": (
             changed(lambda r: r._replace(data=b"odd")),
-            "has a nav_msgs/Odometry in the encoding cdr on /odom that cannot be decoded",
+            "has a nav_msgs/Odometry on /odom that cannot be decoded",
         ),
         "a schema of odd text": (plain(whole, text=lambda r: "~?"),),
-        "an empty folder": (lambda f: f, "metadata.yaml'): give FILE.mcap"),
-        "a folder of two bags": (several, "a folder of them (`ros2 bag reindex FOLDER`"),
+        "an empty folder": (lambda f: f, "Expected metadata file"),
         "a folder that lacks a file": (
             changed_folder(lambda p: (p / "push 1.mcap").unlink(), 3),
-            "push 1.mcap'): give",
+            "push 1.mcap",
         ),
         "a folder with odd metadata": (
             changed_folder(lambda p: (p / "metadata.yaml").write_text("a: [")),
             "ros2 bag reindex",
         ),
-        "a chunk larger than it says, zstd": (
-            content(chunked(zstandard.compress(bytes(2**27)), 100, "zstd")),
-            "more than 67108864 bytes",
-        ),
-        "a record of a terabyte": (
-            content(b"\x89MCAP0\r\n" + struct.pack("<BQ", 5, 2**40) + bytes(1000)),
-            "cannot be read",
-        ),
-        "an unknown compression": (content(chunked(b"?", 100, "br")), "the compression br, "),
-        "a receipt as text": (odd_sqlite, "cannot be decoded"),
+        "a receipt as text": (odd_sqlite, "cannot be"),
         "a receipt beyond 64 bits": (
             changed(lambda r: r._replace(time=2**64 - 1)),
-            "cannot be decoded",
+            "cannot be",
         ),
     }
 
 
 def _frames() -> dict[str, tuple[Any, ...]]:
     """Return bags in other frames."""
-    late_map = transform("map", "odom", 2.0, -1.0, topic="/tf", stamp=9 * SECOND)
-    no_rotation = edited(
-        "/tf_static", set_("transforms.0.transform.rotation", {"w": 0.0}), source=[STATIC["map"]]
-    )
-    from_map, turned = moved("/target", 2.0, -1.0, "map"), framed("/cmd_vel", "turned")
-    no_path = "has {} in the frame {}, and no transform from it to {}".format
     return {
         "frames with a slash": (framed("/target", "/odom", framed("/contact", "/base_link")),),
         "empty frames": (framed("/target", "", framed("/contact", "", framed("/cmd_vel", ""))),),
@@ -712,63 +576,11 @@ def _frames() -> dict[str, tuple[Any, ...]]:
             edited("/odom", set_("child_frame_id", ""), source=framed("/odom", "")),
         ),
         "frames with a prefix": (prefixed(),),
-        "a target in map, static, and a message without transforms": (
-            [Row("/tf", SECOND, {"transforms": []}), *from_map, STATIC["map"]],
-        ),
-        "a target in map, over two transforms": (
-            [
-                *moved("/target", 3.0, 1.0, "earth"),
-                STATIC["map"],
-                transform("earth", "map", 1.0, 2.0),
-            ],
-        ),
-        "a target below odom": (
-            [*moved("/target", -2.0, 1.0, "hall"), transform("odom", "hall", 2.0, -1.0)],
-        ),
-        "a target in map, moving": (moving_map(),),
-        "a target in base_link, once": (
-            [r for r in base_target() if r.time >= 1.04 * SECOND or r.topic != "/cmd_vel"],
-            "",
-            (),
-            1e-12,
-        ),
-        "a contact in another frame": (
-            [*moved("/contact", -0.25, -0.5, "skin", "points"), STATIC["skin"]],
-            "",
-            (),
-            1e-7,
-        ),
-        "a force in another frame": (
-            [*edited("/force", turned_force), STATIC["turned"]],
-            "",
-            (),
-            1e-12,
-        ),
-        "commands in a frame at the base": (
-            [*framed("/cmd_vel", "base_footprint"), STATIC["same"]],
-        ),
-        "a target in map": (framed("/target", "map"), no_path("/target", "map", "odom")),
-        "a target in base_link, before odom": (
-            [r for r in base_target() if r.topic != "/odom" or r.time > 1.2 * SECOND],
-            "no transform of odom to base_link at the time of the message on /target at 1.040 s",
-        ),
-        "a force in a wheel": (framed("/force", "wheel"), no_path("/force", "wheel", "base_link")),
-        "commands in odom": (framed("/cmd_vel", "odom"), "publish commands in base_link"),
-        "commands in a turned frame": (
-            [*turned, STATIC["turned"]],
-            "publish commands in base_link",
-        ),
+        "a target in map": (framed("/target", "map"), "a frame other than odom on /target"),
+        "commands in odom": (framed("/cmd_vel", "odom"), "a frame other than base_link"),
         "frames of odom change": (
             edited("/odom", set_("header.frame_id", "map"), range(9)),
             "a change of frames on",
-        ),
-        "a transform too late": (
-            [*from_map, late_map],
-            "no transform of map to odom at the time of the message",
-        ),
-        "a transform that is no rotation": (
-            [*from_map, *no_rotation],
-            "whose norm is not 1 on /tf_static",
         ),
     }
 
@@ -797,7 +609,7 @@ def _topics() -> dict[str, tuple[Any, ...]]:
         "a key twice": (whole, "name each once", ["odom=/odom", "odom=/o"]),
         "a topic of another type": (
             whole,
-            "has a std_msgs/Float32MultiArray in the encoding cdr on /taxels that cannot",
+            "has a std_msgs/Float32MultiArray on /taxels that cannot",
             {"odom": "/taxels"},
         ),
         "no contacts and taxels": (

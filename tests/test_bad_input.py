@@ -204,13 +204,12 @@ COMMANDS = {
         "es --law aps": "its parameters have no bounds",
         "es --tuned mass": "unknown tuned parameter 'mass': choose from eta",
         "es --tuned L L": "tuned = .* is not allowed: name each once",
-        "es --objective.risk worst": unlike("--objective.risk", "worst", "mean", "cvar"),
-        "grad --starts 0": "unknown option '--starts': rps tune grad follows derivatives",
+        "es --objective.risk worst": "the option objective.risk has been removed",
+        "grad --starts 0": "the option starts has been removed: rps tune grad follows derivatives",
     },
     "ladder": {
         "--domain wide wide": "name each once",
         "--domain wide paper --shard 1/2": "shard is not allowed with several domains",
-        "--domain wide paper --table t.csv": "table is not allowed with several domains",
     },
     "attack": {
         "--axes size colour mass": "unknown axes 'colour'",
@@ -229,7 +228,7 @@ COMMANDS = {
     },
     "regress --laws rps": {"--against best": "unknown against 'best': choose from rps, "},
     "export c --law rps": {"--skin ideal": "name one with taxels", "--prefix 2": "prefix = 2 is"},
-    "shadow": {"none.mcap": "give an MCAP file"},
+    "shadow": {"none.mcap": "give FILE.mcap"},
     "fit": {"none.csv": "none.csv cannot be read"},
     "puhs": {"": "puhs"},
 }

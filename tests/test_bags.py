@@ -161,28 +161,6 @@ def test_a_path_of_equal_poses_is_refused(points, tmp_path, capsys):
     assert "a path without length: publish two different poses or more" in error
 
 
-@pytest.mark.parametrize(
-    ("field", "factors", "words"),
-    [
-        ("pose", (1000, 1000, 1), "x and y may be in mm"),
-        ("twist", (1, 1, 180 / math.pi), "omega may be in deg/s"),
-        ("twist", (1000, 1000, 1), "v_x and v_y may be in mm/s"),
-    ],
-)
-def test_the_report_doubts_a_bag_in_other_units(field, factors, words, tmp_path, capsys):
-    rows = [
-        step._replace(pose=(0.5 * np.sin(0.1 * t), 0.5 - 0.5 * np.cos(0.1 * t), 0.1 * t), time=t)
-        for t, step in zip(np.arange(0, 10, 0.1), steps(100, twist=(0.05, 0, 0.1)), strict=True)
-    ]
-    other = [step._replace(**{field: np.multiply(getattr(step, field), factors)}) for step in rows]
-    for bag_rows, expected in ((rows, False), (other, True)):
-        path = bag.write(tmp_path / "a.mcap", bag_rows, {})
-        assert rps("shadow", path, "--law", "rps", "--out", tmp_path / str(expected)) == 0
-        output = " ".join(capsys.readouterr().out.split())
-        assert ("Check the bag: it has a base that moves" in output) == expected
-        assert (words in output) == expected
-
-
 # --- invalid files -------------------------------------------------------------------------
 
 

@@ -365,16 +365,6 @@ def test_the_bounds_of_a_custom_law_are_a_mapping(registries):
     assert results.v.values == pytest.approx([0.055])
 
 
-def test_commands_accept_a_law_of_a_file(tmp_path, capsys):
-    name, short = f"{LAW}:PParams", "--horizon 0.5 --engine mujoco"
-    table = f"table --objects box --friction S1 --targets 2 0 {short} --laws rps {name}"
-    assert rps(f"{table} --out", tmp_path / "table") == 0
-    assert files.read_results(tmp_path / "table").law.values.tolist() == ["rps", "p_control"]
-    assert rps(f"sweep --worlds 2 --laws {name} {short} --out", tmp_path / "sweep") == 0
-    plan = load_plan(tmp_path / "sweep")
-    assert registry.leaves_to_json(plan.laws["p_control"])["gains.heading"] == 0.1
-
-
 def test_a_run_detects_that_the_file_of_its_law_has_changed(tmp_path):
     law = tmp_path / "mine.py"
     law.write_text(LAW.read_text())

@@ -23,7 +23,6 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
-from rps_jax.geometry import solid
 from rps_jax.record import bag
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import with_contacts
@@ -60,20 +59,19 @@ def put(column, value, where: Any = slice(None)):
 
 
 WRONG = {
-    "lacks the column contact_y": lambda table: table.drop(columns="contact_y"),
+    "lacks contact_y": lambda table: table.drop(columns="contact_y"),
     "has a gap of 2 s at": lambda table: table.drop(index=range(100, 199)),
     "lasts 1.9 s: it must last 5 s": lambda table: table[:95],
     r"v_x and v_y up to 4 m/s, beyond the limit of 3: write SI units": put(
         "v_x", 4.0, slice(9, 12)
     ),
-    "yaw may be in deg": lambda table: table.assign(yaw=10 * table.time),
     "has no contact": put("contact_type", 0),
     r"up to \(0.480, 0.050\) m, and the robot ends at": put("contact_x", 0.48),
     r"target is 20.\d+ m from its start": put("target_x", 20.0),
     r"has 1 taxels, and the robot 42": lambda t: t.drop(
         columns=["contact_type", "contact_x", "contact_y"]
     ).assign(taxel_0=1.0),
-    "lacks the columns object_x, object_yaw": lambda t: t.assign(object_y=1.0),
+    "lacks object_x, object_yaw": lambda t: t.assign(object_y=1.0),
 }
 
 
@@ -95,89 +93,6 @@ def test_tables_are_read_as_users_write_them(kind, tmp_path, compiled):
         else re.search(case.expected, result)
     )
     assert not compiled
-
-
-def drive(delay=0, slip: Any = 0.0, blocked=0.0, noise=0.0, start=0.0, speed=0.1, period=0.02):
-    """Return the log of a base that slips, lags or is blocked for a share of its commands.
-
-    The slip is one number, or those of v_x, v_y and omega.
-    """
-    rng, time = default_rng(0), np.arange(0.0, 12.0, period)
-    count = len(time)
-    twist = np.stack([speed + 0 * time, 0.03 * np.sin(time), 0.3 * np.sin(0.7 * time)], -1)
-    blocks = (np.arange(count) % 200 < 200 * blocked)[:, None]
-    share = np.where(blocks, 0.0, 1 - np.array(slip))
-    done = share * np.concatenate([np.zeros((delay, 3)), twist[: count - delay]])
-    yaw = start + period * np.cumsum(done[:, 2])
-    velocity = solid.rotate(yaw, done)[:, :2]
-    pose = np.column_stack([period * np.cumsum(velocity, 0), yaw]) + noise * rng.normal(
-        size=(count, 3)
-    )
-    columns = dict(zip(("x", "y", "yaw", "v_x", "v_y", "omega"), (*pose.T, *twist.T), strict=True))
-    touch = {"contact_type": 1, "contact_x": 0.3625, "contact_y": 0.05}
-    return pd.DataFrame({"time": time, **columns, **touch, "target_x": 2.0, "target_y": 0.5})
-
-
-@pytest.mark.parametrize(
-    "faults",
-    [
-        {"delay": 25},
-        {"slip": 0.5},
-        {"slip": 0.9},
-        {"slip": (0.1, 0.9, 0.9)},
-        {"slip": (0.0, 0.2, 0.45)},
-        {"blocked": 0.7},
-        {"blocked": 1.0},
-        {"blocked": 1.0, "noise": 0.005, "speed": 0.3},
-        {"noise": 0.02},
-        {"start": 40.0},
-        {"speed": 0.0, "noise": 0.01},
-        {"delay": 2, "slip": 0.3, "blocked": 0.5, "period": 0.1},
-    ],
-    ids=str,
-)
-def test_imperfect_robots_have_no_wrong_units(faults, tmp_path):
-    table = drive(**faults)
-    log = logs.read(written(tmp_path / "log.csv", table), SHELL)
-    assert_allclose(log.columns["pose"], table[["x", "y", "yaw"]], atol=1e-9)
-
-
-def test_other_units_are_converted_and_reported(tmp_path):
-    path = written(tmp_path / "log.csv", log_table().rename(columns={"yaw": "yaw [deg]"}))
-    question = fit.Fit(path, columns={"x": "x [m]"})
-    assert "Converted: yaw from deg to rad." in question.intro(None)
-    with refusing("columns = x=a is not allowed: no log is a table"):
-        rps_jax.fit(tmp_path / "log.mcap", columns="x=a")
-
-
-def test_parquet_needs_pyarrow(tmp_path, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    (tmp_path / "log.PARQUET").write_bytes(b"PAR1")
-    with refusing("run pip install pyarrow, or name a"):
-        logs.read(tmp_path / "log.PARQUET", SHELL)
-
-
-def test_parquet_is_read_as_csv_is(tmp_path):
-    pytest.importorskip("pyarrow", reason="pip install pyarrow to read Parquet")
-    table, path = bad_tables.push(), tmp_path / "log.parquet"
-    expected = logs.read(bad_tables.reference(tmp_path), SHELL).columns
-    stamps = pd.Timestamp("2026-03-01T10:15:00Z") + pd.to_timedelta(table.time, "s")
-    for variant in (table, table.set_index("time"), table.assign(time=stamps)):
-        variant.to_parquet(path)
-        same(logs.read(path, SHELL).columns, expected, atol=1e-6)
-    for column, value, cell in (
-        ("yaw", None, "an empty cell"),
-        ("yaw", "1,2.5", "'1,2.5'"),
-        ("yaw", "left", "'left'"),
-        ("contact_type", True, "'True'"),
-        ("x", np.nan, "an empty cell"),
-    ):
-        table.assign(**{column: value}).to_parquet(path)
-        with refusing(f"{cell}.*row 1|row 1, column {column}, but {cell}"):
-            logs.read(path, SHELL)
-    path.write_bytes(path.read_bytes()[:500])
-    with refusing("is no Parquet table"):
-        logs.read(path, SHELL)
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,6 @@
 import re
 
 import numpy as np
-import pandas as pd
-import pytest
 import xarray as xr
 from helpers import (
     CYLINDERS,
@@ -23,7 +21,7 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import policy
-from rps_jax.runs.results import load, write_table
+from rps_jax.runs.results import load
 from rps_jax.studies import ladder
 from rps_jax.trials.setting import seed_of
 from rps_jax.world import draws
@@ -133,54 +131,6 @@ def test_the_command_reports_information_against_success(tmp_path, capsys):
         assert f"## {heading}" in text
     assert (tmp_path / "ladder.png").stat().st_size > 10_000
     assert load(tmp_path).success.sizes == {"law": 2, "world": 6}
-
-
-def test_outcomes_are_written_as_a_long_table(tmp_path, monkeypatch):
-    setting = setting_of(2.0)
-    path = tmp_path / "results.csv"
-    results = climb(("rps", "dipole"), CYLINDERS, 6, setting=setting, slots=8, table=path)
-    table = pd.read_csv(path)
-    assert table.law.tolist() == ["rps"] * 6 + ["dipole"] * 6
-    assert table.world.tolist() == [*range(6)] * 2
-    assert set(table.object) == {"random_cylinder"}
-    for (law, world), row in table.set_index(["law", "world"]).iterrows():
-        trial = results.sel(law=law, world=world)
-        for name in ("success", "time", "path_length", "mass", "friction_ground", "omega_error"):
-            assert row[name] == pytest.approx(float(trial[name]), rel=1e-6), name
-        poses = row[["base_x", "base_y", "base_yaw", "object_x", "object_y", "object_yaw"]]
-        expected = np.concatenate([trial.base_pose, trial.object_pose])
-        assert_allclose(poses.astype(float), expected, rtol=1e-5)
-        assert row.senses == str(trial.senses.values)
-    columns = pd.read_csv(tmp_path / "results.columns.csv", keep_default_na=False)
-    assert columns.column.tolist() == list(table)
-    units = dict(zip(columns.column, columns.unit, strict=True))
-    assert (units["time"], units["mass"], units["base_yaw"], units["law"]) == ("s", "kg", "rad", "")
-    assert all(columns.meaning)
-    for name in ("other.CSV", "other.csv.gz"):
-        write_table(results, tmp_path / name)
-        compression = "gzip" if name.endswith("gz") else None
-        pd.testing.assert_frame_equal(pd.read_csv(tmp_path / name, compression=compression), table)
-        assert (tmp_path / "other.columns.csv").exists()
-    # pyarrow is optional, so pandas writes text instead of Parquet here.
-    monkeypatch.setattr(pd.DataFrame, "to_parquet", pd.DataFrame.to_csv)
-    write_table(results, tmp_path / "other.parquet")
-    assert (tmp_path / "other.parquet").read_text() == path.read_text()
-
-
-def write_without_pyarrow(**options):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("importlib.util.find_spec", lambda name: None)
-        climb("rps", **options)
-
-
-test_invalid_tables_are_refused = refusals(
-    write_without_pyarrow,
-    ({"table": "results.xls"}, "name a file NAME.csv or NAME.parquet"),
-    ({"table": "results.parquet.gz"}, "name a file NAME.csv or NAME.parquet"),
-    ({"table": "nowhere/results.csv"}, "nowhere is not a folder"),
-    ({"table": "r.csv", "shard": "1/2", "out": "run"}, "table is not allowed with a shard"),
-    ({"table": "results.parquet"}, "run pip install pyarrow, or name a .csv file"),
-)
 
 
 LAW = ROOT / "notebooks" / "examples" / "custom_law.py"

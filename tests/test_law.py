@@ -178,13 +178,6 @@ def test_eqs_1_and_2_split_the_speed_by_the_slope(v_star, a_r, expected):
     assert_allclose(rps.linear_velocity(v_star, a_r), expected, rtol=1e-6)
 
 
-def test_eq_3_makes_the_speed_proportional_to_the_distance():
-    for d, distance in [((1.2, -0.5), 1.3), ((-48.0, 20.0), 52.0), ((0.384, 0.112), 0.4)]:
-        for l, l_th in [(0.0, 0.24), (0.1, 0.24), (-0.2, 0.15)]:  # noqa: E741
-            v_x, v_y, _ = twist_of(UNBOUNDED._replace(K_v=0.3), observe(d, l), l_th)
-            assert math.hypot(v_x, v_y) == pytest.approx(0.3 * distance, rel=1e-5)
-
-
 def test_eq_4_points_from_the_contact_to_the_target_in_the_world():
     # At yaw 90 degrees the robot's x is the world's y, and its y the world's -x:
     # the contact (0.3, 0.1) of a robot at (2, -1) is at (2 - 0.1, -1 + 0.3).

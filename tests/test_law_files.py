@@ -17,7 +17,6 @@ from rps_jax.app.shadow import shadowed
 from rps_jax.control import registry
 from rps_jax.record import files
 from rps_jax.runs.plan import Plan, load_plan, open_run
-from rps_jax.trials.results import nan_twists
 from rps_jax.world.domain import Domain
 
 pytestmark = pytest.mark.usefixtures("registries")
@@ -85,18 +84,13 @@ def step(params, state, obs):
     assert ended.nan_twist.values.tolist() == ended.diverged.values.tolist() == [1, 1]
     assert_allclose(ended.time, 3 * setting.physics.control_period, rtol=1e-6)
     assert not results.sel(law="rps").nan_twist.any()
-    sentence = nan_twists(results)
-    assert sentence.startswith("mine returned a twist that is not finite (NaN or infinite) in 2 of")
-    assert "first at 0.06 s" in sentence
-    assert nan_twists(results.sel(law=["rps"])) == ""
 
 
-def test_the_commands_print_that_the_law_returned_nan(tmp_path, capsys):
+def test_the_commands_warn_that_the_law_returned_nan(tmp_path):
     path = write_law(tmp_path, "v_y = jnp.inf * details.distance")
     brief = "--engine mujoco --horizon 0.2"
     with pytest.warns(UserWarning, match="a law returned NaN"):
         assert rps(f"sweep --worlds 2 --laws {path} {brief} --out", tmp_path / "s") == 0
-    assert "mine returned a twist that is not finite" in capsys.readouterr().out
     with pytest.warns(UserWarning, match="a law returned NaN"):
         evaluate(registry.LAWS["mine"], worlds=2, setting=BRIEF)
 
@@ -136,7 +130,7 @@ def test_shadow_counts_twists_that_are_not_finite(tmp_path):
     results = xr.Dataset(
         {k: (("source", "time"), both[..., i]) for i, k in enumerate(("v_x", "v_y", "omega"))},
         {"source": ["commanded", "law"], "time": recorded["time"]},
-        {"law": "mine", "doubts": ""},
+        {"law": "mine"},
     )
     question = Shadow("a.mcap", str(path))
     (section,) = question.report(results, question.create_run(None, lambda progress: None))

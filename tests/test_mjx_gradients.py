@@ -3,7 +3,6 @@
 import contextlib
 import importlib.metadata
 import importlib.util
-import itertools
 import os
 import re
 import shutil
@@ -12,7 +11,6 @@ import sys
 import tomllib
 from functools import cache, partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -30,14 +28,13 @@ from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.fused import contacts, newton
 from rps_jax.engines.fused import step as fused
 from rps_jax.engines.mjx_colliders import mjx
-from rps_jax.geometry import solid
 from rps_jax.geometry import vectors as sp
 from rps_jax.robot.robot import Robot
 from rps_jax.trials.worlds import starts
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import Friction, WorldInputs
+from rps_jax.world.scene import WorldInputs
 
 BOX = """<body pos="0 0 0.0985"><freejoint/>
 <geom type="box" size="0.2 0.15 0.1" mass="2" friction="0.6"/></body>"""
@@ -218,27 +215,6 @@ def check_finite(gradients):
         assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)
 
 
-@pytest.mark.slow
-def test_gradients_of_our_boxes_are_finite_and_those_of_the_fused_engine():
-    """Check float32 and the standard solver; only flat boxes have equal contacts in both engines.
-
-    MJX has up to four contacts, within 1 mm of the deepest, and fused has all corners. The solvers
-    end at different errors, of up to 1e-3 of an acceleration.
-    """
-    worlds = some_worlds("random_box", 400, driven=False)
-    weights = jax.random.normal(jax.random.key(0), (400, 22))
-    values, gradients = pulled_back("mjx", worlds, STEP, weights)
-    check_finite(gradients)
-    expected = pulled_back("fused", worlds, STEP, weights)
-    for ours, theirs in zip(
-        (values, *gradients[1:4]), (expected[0], *expected[1][1:4]), strict=True
-    ):
-        error = np.abs(ours - theirs).max(axis=1) / np.abs(theirs).max(axis=1)
-        flat = error.reshape(-1, 4)[:, :2]
-        assert np.median(flat) < 1e-3
-        assert (flat < 0.02).mean() > 0.95
-
-
 CLASSES = ("sticking", "sliding", "edge", "corner", "tipping")
 CONVERGED = {"iterations": 60, "ls_iterations": 60, "tolerance": 0.0}
 
@@ -257,59 +233,6 @@ def check_agreement(pairs, kinds, bounds):
             if (quantiles > bounds[label]).any():
                 excess[name, label] = quantiles
     assert not excess
-
-
-@pytest.mark.slow
-def test_the_fused_engine_has_the_gradients_of_mjx_for_a_box_on_a_plane(box, monkeypatch):
-    """Compare 200 states of the box by state and friction, in float64; the base is far away.
-
-    The contacts are deeper than 1 mm, where the impedance of MuJoCo's default is constant.
-    """
-    monkeypatch.setattr(newton, "_TOLERANCE", 1e-13)
-    count, rng, half = 200, default_rng(2), box.plain.geom_size[1]
-    kinds = np.arange(count) % len(CLASSES)
-    lean = np.choose(kinds[:, None], [0.0, 1e-4, [[0.1, 0]], 0.1, [[0.1, 0]]])
-    speeds = np.choose(kinds[:, None], [0.0, 1.0, 0.05, 1.0, [[0.05] * 3 + [5.0] + [0.05] * 2]])
-    lean = lean * rng.uniform(0.5, 1.5, (count, 2)) * rng.choice([-1, 1], (count, 2))
-    quaternions = np.column_stack([np.ones(count), lean, kinds * 0])
-    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    states = np.tile(box.state(*np.zeros(6)), (count, 1))
-    states[:, 3:7], states[:, 7:13] = quaternions, 0.1 * speeds * rng.normal(size=(count, 6))
-    corners = half * np.array(list(itertools.product((-1, 1), repeat=3)))
-    heights = [sp.to_world(sp.matrix(quaternions.T), x)[2] for x in corners]
-    states[:, 2] = -np.min(heights, axis=0) - rng.uniform(1.5e-3, 2e-3, count)
-
-    weights = rng.normal(size=(count, 13))
-    slopes = np.stack([box.jacobian(x) for x in states])[:, :13]
-    expected = np.einsum("ni,nij->nj", weights, slopes)
-    expected[:, 3:7] -= (expected[:, 3:7] * quaternions).sum(axis=1)[:, None] * quaternions
-
-    ones = np.ones(count)
-    outline = solid.rectangles(half[0] * ones, half[1] * ones)
-    sizes = 0 * ones, 2 * half[2] * ones, 2 * ones, 0 * ones, 0 * ones, 0.5 * ones
-    shape = solid.build(outline, *sizes)
-    drawn = SimpleNamespace(solid=shape, friction=Friction(ones, ones))
-    away = np.tile([-5.0, 0.0, 0.0], (count, 1))
-    motion = np.hstack([away, states[:, :7]]), np.hstack([0 * away, states[:, 7:13]]), 0 * away
-    pads = [np.zeros((count, 3))] * 3
-    outputs = np.hstack([pads[0], weights[:, :7], pads[1], weights[:, 7:], pads[2]])
-    steps = {"timestep": 0.004, "control_period": 0.004, "impratio": 1.0}
-    physics = Physics(**steps, ground_solref=(0.02, 1.0), ground_impedance=0.95, **CONVERGED)
-    worlds = "box", drawn, Robot(), None, list(motion)
-    _, (fields, qpos, qvel, *_) = pulled_back("fused", worlds, physics, outputs)
-    pairs = {
-        "positions": (qpos[:, 3:], expected[:, :7]),
-        "velocities": (qvel[:, 3:], expected[:, 7:13]),
-        "friction": (fields.friction_ground, expected[:, 13]),
-    }
-    bounds = {
-        "sticking": (2e-6, 5e-6, 1e-5),
-        "sliding": (2e-6, 2e-4, 1e-3),
-        "edge": (3e-5, 1e-4, 1e-4),
-        "corner": (5e-5, 5e-4, 1e-3),
-        "tipping": (3e-5, 1e-4, 3e-4),
-    }
-    check_agreement(pairs, kinds, bounds)
 
 
 def sunk(worlds):

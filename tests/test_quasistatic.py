@@ -21,7 +21,6 @@ from scipy.optimize import nnls
 from staging import drive, staged
 
 from rps_jax.control import registry
-from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import quasistatic
 from rps_jax.engines.base import Motion
 from rps_jax.engines.quasistatic import Contact, Problem, Quasistatic, Slider, solved
@@ -30,7 +29,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
-from rps_jax.trials import pushes, trial
+from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.world import objects, paper, scene
@@ -431,45 +430,6 @@ def test_derivatives_of_a_push_are_those_of_finite_differences():
         slope = sum(np.vdot(a[0], b) for a, b in pairs)
         assert abs(slope) > 1e-3
         assert slope == pytest.approx((where[1 + 2 * part] - where[2 + 2 * part]) / 2e-6, rel=3e-3)
-
-
-TUNED = ("K_h", "K_v", "L", "beta", "k", "eta", "v_max", "omega_max")
-
-
-@functools.cache
-def closed_loop():
-    """Three seconds of RPS, and their derivatives: the nominal world, then each parameter moved up
-    and down."""
-    with jax.enable_x64(True):
-        default = RPSParams()
-        changes = [(name, e) for name in TUNED for e in (1e-5, -1e-5)]
-        nudges = [default._replace(**{n: getattr(default, n) * (1 + e)}) for n, e in changes]
-        cases = [Case("box", FRICTION["S1"], (1.0, 2.0), p, gap=0.0) for p in (default, *nudges)]
-        built = pushes.build(cases, Setting(engine="quasistatic"))
-        _, worlds, stage, nudged = jax.device_put(built)
-        loop = trial.ControlLoop(preset())
-
-        @jax.jit
-        @partial(jax.value_and_grad, has_aux=True)
-        def run(params):
-            start = trial.start_all(worlds, params, jnp.ones(len(cases), bool))
-            step = partial(trial.control_step, stage, worlds, params, loop=loop)
-            _, recorded = jax.lax.scan(lambda trials, _: step(trials), start, length=150)
-            distance = jnp.mean(recorded.details.distance, axis=0)
-            return jnp.sum(distance), distance
-
-        (_, distance), gradient = run(nudged)
-        return jax.device_get(distance), jax.device_get(gradient)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", TUNED)
-def test_derivatives_of_the_closed_loop_are_those_of_finite_differences(name):
-    distance, gradient = closed_loop()
-    i = 1 + 2 * TUNED.index(name)
-    step = 2e-5 * getattr(RPSParams(), name)
-    slope = (distance[i] - distance[i + 1]) / step
-    assert getattr(gradient, name)[0] == pytest.approx(slope, rel=1e-3, abs=1e-9)
 
 
 # --- the stage ------------------------------------------------------------------------------

@@ -95,12 +95,11 @@ REFUSED = {
     ],
     then("check", IdealSkin): [
         *all_fields(IdealSkin),
-        *each(temperature=0.0),
-        ({"tolerance": -1.0, "temperature": 0.001}, "tolerance"),
+        *each(tolerance=-1.0),
     ],
     then("check", CapacitiveSkin): [
         *all_fields(CapacitiveSkin),
-        *each(foam=0.0, time_constant=0.0, max_compression=1.0, dead_share=1.1),
+        *each(foam=0.0, time_constant=0.0, max_compression=1.0, dead_share=1.1, temperature=0.0),
     ],
     lambda **changes: registry.smooth_law(rps.LAW, Temperatures(**changes)): [
         ({name: bad}, f"temperature {name} = ")
@@ -111,7 +110,7 @@ REFUSED = {
         *(({"names": names}, "tuned") for names in ((), ("L", "L"), ("mass",), ("v_max",))),
         ({"names": ("gamma_max",), "base": RPSParams(gamma_max=INF)}, "gamma_max"),
     ],
-    Objective: each(risk="worst", time=-1.0, tail=0.0, miss=NAN),
+    Objective: each(time=-1.0, miss=NAN),
 }
 
 

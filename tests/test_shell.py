@@ -61,7 +61,7 @@ def test_taxels_are_sampled_a_centimetre_apart():
 def test_boards_at_the_papers_pitch_give_the_papers_readings():
     pitch = 0.58 / 12
     sides = Boards("left", 5, pitch), Boards("front", 4, pitch), Boards("right", 5, pitch)
-    for sensor in (IdealSkin(), CapacitiveSkin(), IdealSkin(temperature=0.001)):
+    for sensor in (IdealSkin(), CapacitiveSkin(), CapacitiveSkin(temperature=0.03)):
         for y in (0.0, 0.13, -0.33, 0.391):
             expected = read(sensor, square(0.46, y))
             reading = read(sensor._replace(shell=Robot(boards=sides).shell), square(0.46, y))
@@ -77,8 +77,9 @@ def test_nothing_is_felt_without_a_board(sensor):
     half = read(worn, square(0.46, 0.15))  # of an object from 0.05 to 0.25
     assert int(half.contact_type) == LINE
     assert_allclose(half.p_robot_contact, [0.3625, 0.10], atol=0.01)
-    smooth = worn._replace(temperature=0.0005 if isinstance(worn, IdealSkin) else 0.01)
-    contact = read(smooth, square(0.46, 0.15)).p_robot_contact
+    if isinstance(worn, IdealSkin):
+        return
+    contact = read(worn._replace(temperature=0.01), square(0.46, 0.15)).p_robot_contact
     assert_allclose(contact, half.p_robot_contact, atol=0.01)
 
 

@@ -41,7 +41,7 @@ from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.laws.rps_plus import RPSPlusParams
 from rps_jax.control.observation import Observation
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot.skin import NONE, CapacitiveSkin, IdealSkin
+from rps_jax.robot.skin import NONE, CapacitiveSkin
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.trial import ControlLoop
@@ -303,8 +303,7 @@ def test_derivatives_agree_with_finite_differences():
 
 NEAR = (-0.001, 0.02)  # [m] gaps
 IMPERFECT = CapacitiveSkin(gain_spread=0.2, dead_share=0.2)
-SENSORS = {"ideal": IdealSkin(temperature=1e-3), "capacitive": CapacitiveSkin(temperature=0.03)}
-both_sensors = pytest.mark.parametrize("skin", SENSORS.values(), ids=SENSORS)
+SMOOTH = CapacitiveSkin(temperature=0.03)
 
 
 def box(pose) -> Footprint:
@@ -323,17 +322,11 @@ def flush(gap=0.0, y=0.0, yaw=0.0) -> tuple[float, float, float]:
     return (FRONT + 0.2 + gap, y, yaw)
 
 
-LIMITS = [
-    # Sensor, a slightly duller and a slightly keener one: where these agree nothing is at an edge.
-    (IdealSkin(), *(IdealSkin(tolerance=0.006 + x) for x in (-5e-5, 5e-5))),
-    (IMPERFECT, *(IMPERFECT._replace(threshold=0.25 + x) for x in (1e-3, -1e-3))),
-]
-
-
-@pytest.mark.parametrize(("sensor", "dull", "keen"), LIMITS, ids=["ideal", "capacitive"])
 @any_seed
-def test_without_heat_the_smooth_skin_is_the_skin(sensor, dull, keen, seed):
+def test_without_heat_the_smooth_skin_is_the_skin(seed):
     """This includes corners, and dead taxels within a contact."""
+    # A slightly duller and a slightly keener skin: where these agree nothing is at an edge.
+    sensor, dull, keen = (IMPERFECT._replace(threshold=0.25 + x) for x in (0, 1e-3, -1e-3))
     shapes, key = random_shapes(seed, NEAR), jax.random.key(seed % 2**31)
     exact, less, more = (sense_all(s, shapes, key) for s in (sensor, dull, keen))
     cold = sense_all(sensor._replace(temperature=1e-6), shapes, key)
@@ -348,10 +341,9 @@ def test_without_heat_the_smooth_skin_is_the_skin(sensor, dull, keen, seed):
     assert_allclose(cold.p_robot_contact[felt], exact.p_robot_contact[felt], atol=4e-4)
 
 
-@pytest.mark.parametrize("sensor", [IdealSkin(), IMPERFECT], ids=["ideal", "capacitive"])
 @any_seed
-def test_the_skin_converges_as_its_temperature_falls(sensor, seed):
-    warm = 0.03 if isinstance(sensor, CapacitiveSkin) else 1e-3
+def test_the_skin_converges_as_its_temperature_falls(seed):
+    sensor, warm = IMPERFECT, 0.03
     shapes, key = random_shapes(seed, NEAR), jax.random.key(seed % 2**31)
     exact = sense_all(sensor, shapes, key)
     felt = np.asarray(exact.in_contact)
@@ -365,10 +357,8 @@ def test_the_skin_converges_as_its_temperature_falls(sensor, seed):
     assert far[2] < 0.5 * far[0]
 
 
-@both_sensors
-def test_a_contact_grows_as_the_object_nears_and_is_half_at_the_threshold(skin):
-    # The ideal threshold is 6 mm; foam of 10 mm has 1.25 times its capacitance at 8 mm.
-    threshold = 0.006 if isinstance(skin, IdealSkin) else 0.008
+def test_a_contact_grows_as_the_object_nears_and_is_half_at_the_threshold():
+    skin, threshold = SMOOTH, 0.008  # where foam of 10 mm has 1.25 times its capacitance
     gaps = np.append(np.linspace(0.03, -0.001, 63), threshold)
     reading = read(skin, [flush(gap, 0.05) for gap in gaps])
     weight = reading.in_contact[:-1]
@@ -386,26 +376,10 @@ def differences(skin, poses, step, h: float) -> np.ndarray:
     return (contacts[: len(up)] - contacts[len(up) :]) / (2 * h)
 
 
-def test_an_ideal_contact_moves_with_the_object():
-    """The contact of a flush box moves sideways with the box."""
-    poses = [flush(0.001, y) for y in np.linspace(-0.07, 0.07, 40)]
-    slopes = differences(SENSORS["ideal"], poses, (0, 1, 0), 1e-3)
-    assert_allclose(slopes, np.tile([0.0, 1.0], (40, 1)), atol=5e-3)
-
-
-def test_a_flush_box_that_turns_moves_its_contact_at_once():
-    """The plain skin feels both corners of a flush box, until one is beyond its tolerance."""
-    pose, step = [flush(0.004)], (0, 0, 1)
-    assert differences(IdealSkin(), pose, step, 1e-3)[0, 1] == pytest.approx(0.0, abs=0.1)
-    # Turned to the left its left end is the nearer one.
-    assert differences(SENSORS["ideal"], pose, step, 1e-3)[0, 1] > 0.5
-
-
-@both_sensors
 @any_seed
-def test_a_mirrored_object_gives_the_mirrored_smooth_reading(skin, seed):
+def test_a_mirrored_object_gives_the_mirrored_smooth_reading(seed):
     shapes, key = random_shapes(seed, NEAR), jax.random.key(0)
-    reading, mirrored_reading = (sense_all(skin, x, key) for x in (shapes, mirrored(shapes)))
+    reading, mirrored_reading = (sense_all(SMOOTH, x, key) for x in (shapes, mirrored(shapes)))
     assert_allclose(mirrored_reading.in_contact, reading.in_contact, atol=1e-3)
     expected = reading.p_robot_contact * np.array([1, -1])
     assert_allclose(mirrored_reading.p_robot_contact, expected, atol=2e-3)
@@ -435,14 +409,13 @@ def read_and_slope(pose, skin):
     return numbers_read(pose, skin), jax.jacfwd(numbers_read)(pose, skin)
 
 
-@both_sensors
-def test_the_derivatives_of_a_smooth_reading_are_finite_everywhere(skin):
-    for colder in (skin, skin._replace(temperature=1e-6)):
+def test_the_derivatives_of_a_smooth_reading_are_finite_everywhere():
+    for colder in (SMOOTH, SMOOTH._replace(temperature=1e-6)):
         chex.assert_tree_all_finite(read_and_slope(np.array(POSES, np.float32), colder))
 
 
-@both_sensors
-def test_the_derivatives_of_a_smooth_reading_agree_with_finite_differences(skin):
+def test_the_derivatives_of_a_smooth_reading_agree_with_finite_differences():
+    skin = SMOOTH
     poses = np.resize(np.array(POSES[-2:], np.float32), (len(POSES), 3))
     slopes = np.asarray(read_and_slope(poses, skin)[1])[:2]
     assert np.abs(slopes).max() > 0.1
@@ -468,9 +441,9 @@ def push(case: Case, law, horizon: float):
 def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     """The push starts before the first touch and turns towards a target at the side."""
     start = case((1.0, -1.5), name, gap=0.005)
-    cold = replace(start, skin=IdealSkin(temperature=1e-6))
-    exact = push(start, rps.LAW, 10.0)
-    got = push(cold, registry.smooth_law(rps.LAW, COLD), 10.0)
+    cold = replace(start, skin=CapacitiveSkin(temperature=1e-6))
+    exact = push(replace(start, skin=CapacitiveSkin()), rps.LAW, 5.0)
+    got = push(cold, registry.smooth_law(rps.LAW, COLD), 5.0)
     assert abs(exact.qpos[2]) > 0.2  # it turned
     assert_allclose(got.qpos, exact.qpos, atol=2e-3)
     assert got.contact_steps == pytest.approx(exact.contact_steps, abs=1)
@@ -481,7 +454,7 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
 @pytest.mark.parametrize("law", [rps.LAW, registry.smooth_law(rps.LAW)], ids=["hard", "smooth"])
 def test_with_a_warm_skin_a_push_arrives(law):
     """Both laws succeed; the hard law reads the binary contact."""
-    ended = push(case((0.7, 0.05), skin=IdealSkin(temperature=0.001)), law, 30.0)
+    ended = push(case((0.7, 0.05), skin=SMOOTH), law, 30.0)
     assert ended.success
     assert ended.lost_steps == 0
 

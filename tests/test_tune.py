@@ -156,12 +156,6 @@ def test_sooner_and_nearer_is_better():
     assert (np.diff(scores, axis=1) > 0).all()
 
 
-def test_risk():
-    scores = jnp.arange(20.0)
-    assert float(Objective().value(scores)) == pytest.approx(9.5)
-    assert float(Objective(risk="cvar", tail=0.1).value(scores)) == pytest.approx(18.5)
-
-
 def test_a_trial_without_contact_missed_by_the_whole_way():
     zero = np.zeros(1)
     for least, missed in ((np.inf, 0.5), (0.2, 0.2)):
@@ -234,9 +228,7 @@ def test_quick_tunes_few_parameters_of_rps_and_all_of_other_laws():
 def test_the_report_of_a_quick_run_says_so_first():
     assert TuneES("rps").quick_note() == ""
     note = TuneES("rps", quick=True, worlds=7).with_quick_values().quick_note()
-    assert note.startswith("**This is a quick run** (tuned K_h, K_v, l_cr, d_th; objects random_cy")
-    assert "; engine quasistatic; horizon 150.0; validation 64; " in note
-    assert "; worlds 7; " in note
+    assert note.startswith("**This is a quick run**")
 
 
 def test_the_test_of_a_tuned_law_says_whether_it_is_better():

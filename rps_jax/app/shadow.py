@@ -30,7 +30,7 @@ from rps_jax.robot import robot as robots
 from rps_jax.robot.robot import Robot, RobotLike
 from rps_jax.robot.skin import CapacitiveSkin, check_taxels, ends_of, with_contacts
 from rps_jax.runs.question import BagQuestion, Run, call_of
-from rps_jax.tuning.logs import COLUMNS, motion_faults
+from rps_jax.tuning.logs import COLUMNS
 from rps_jax.world.tasks.path import PathCourse
 
 _STILL = 1e-3  # [m] by which the points of a path may move
@@ -41,8 +41,8 @@ class Shadow(BagQuestion[xr.Dataset]):
     """Feed a recorded bag to a law, and compare its twists with the recorded ones."""
 
     file: str | Path = option("", positional=True)
-    """Bag with what a robot observed, as `rps push --bag` or `ros2 bag record` writes it: an MCAP
-    file, a .db3 file or a folder."""
+    """Bag with what a robot observed, as `rps push --bag` or `ros2 bag record` writes it:
+    FILE.mcap, FILE.db3 or a folder."""
     law: LawLike = "rps_plus"
     """The law, by its name or its file, with changes, as rps_plus,mine.json."""
     robot: RobotLike = "ideal"
@@ -71,7 +71,7 @@ class Shadow(BagQuestion[xr.Dataset]):
         """Check the law, the robot and the bag."""
         registry.check_drive(self.params, robots.parse_robot(self.robot).drive)
         if not bags.is_bag(Path(self.file)):
-            rule = "give an MCAP file, a .db3 file, or a folder of `ros2 bag record`"
+            rule = "give FILE.mcap, FILE.db3 or a folder of `ros2 bag record`"
             raise errors.not_allowed("bag", self.file, rule)
         _ = self.steps
 
@@ -83,8 +83,6 @@ class Shadow(BagQuestion[xr.Dataset]):
         recorded |= {"twist": robot.twist_of_middle(recorded["twist"])}
         if "target" not in recorded:
             recorded |= {"target": pursued(recorded, self.lookahead)}
-        motion = (recorded[name] for name in ("time", "pose", "twist"))
-        doubts = "; it ".join(motion_faults(*motion))  # the base may follow other commands
         twists = shadowed(registry.law_of(self.params), self.params, recorded, robot)
         both = np.stack([recorded["twist"], twists])
         pairs = zip(COLUMNS["twist"].items(), np.moveaxis(both, -1, 0), strict=True)
@@ -92,8 +90,7 @@ class Shadow(BagQuestion[xr.Dataset]):
         if robot.drive != "omni":  # of which v_y follows from omega
             del columns["v_y"]
         coords = {"source": ["commanded", "law"], "time": recorded["time"]}
-        attrs = {"law": registry.resolve_law(self.law)[0], "doubts": doubts}
-        return xr.Dataset(columns, coords, attrs)
+        return xr.Dataset(columns, coords, {"law": registry.resolve_law(self.law)[0]})
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Return the differences between the twists of the law and the recorded ones."""
@@ -113,8 +110,6 @@ class Shadow(BagQuestion[xr.Dataset]):
             f"differences between the twists of {results.attrs['law']} and the recorded ones, at "
             "the same observations."
         )
-        if results.attrs["doubts"]:
-            text += f" Check the bag: it {results.attrs['doubts']}."
         if count := int(is_nan.sum()):
             text += (
                 f" {results.attrs['law']} returned NaN or infinity at {count} of {is_nan.size} "

@@ -1,4 +1,4 @@
-"""The viewer: a push in the browser, which users can rewind, disturb and start again.
+"""The viewer: a push in the browser, which users can rewind and disturb.
 
 viser serves the page. The thread of `Page.run` builds and simulates pushes and draws them; requests
 of browsers wait for it in a queue.
@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.app.drawing import TARGET, Drawing, furnish
-from rps_jax.app.gate import HOST, Gate, accepts_update, check_guarded
+from rps_jax.app.drawing import Drawing, furnish
+from rps_jax.app.gate import HOST, check_guarded, guarding
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
@@ -33,11 +33,11 @@ from rps_jax.runs.plan import Plan, build_batch, load_plan, scene_of, world_titl
 from rps_jax.runs.push import case_options, end_in_words, program_slots, select_law
 from rps_jax.runs.question import Command, call_of, set_period
 from rps_jax.trials import pushes
-from rps_jax.trials.case import Case, label_of
+from rps_jax.trials.case import Case
 from rps_jax.trials.live import CHUNK, Live, yaw_target
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.setting import Setting
-from rps_jax.world import objects, tasks
+from rps_jax.world import tasks
 from rps_jax.world.scene import Scene
 
 if TYPE_CHECKING:
@@ -47,7 +47,6 @@ _TICK = 0.04  # [s] between two frames
 _PANEL_TICK = 0.25  # [s] between two updates of the panel, which browsers are slow to lay out
 _MAX_ELAPSED = 0.5  # [s] between two ticks, also if a push was built in the first
 _BUDGET = 0.15  # [s] of simulation between two updates of the page
-_DRAGGING = [f"TransformControls{event}Message" for event in ("Update", "DragStart", "DragEnd")]
 Event: TypeAlias = Any  # of viser, which is optional
 _CONTACTS = ("no contact", "point contact", "line contact")
 
@@ -62,7 +61,7 @@ class Push(NamedTuple):
 
 @dataclass(frozen=True)
 class View(Command[None], Case):
-    """Push in the browser: watch, drag the target, shove the object, push again."""
+    """Push in the browser: watch, drag the target, shove the object, rewind."""
 
     law: LawLike | None = None
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
@@ -114,43 +113,29 @@ class View(Command[None], Case):
 
     def execute(self, callback: ProgressCallback) -> None:
         """Serve the page until it is ended."""
-        law = registry.resolve_law(self.case.params)[0]
-        law = named if isinstance(named := self.case.named_law, str) else law
-        request = PushRequest(self.object, label_of(self.friction), law, self.target)
-        first = partial(self.push_of, request)
+        build = self.push
         if self.run is not None:
-            first = partial(_in_world, Path(self.run), *self._chosen(self.run), self.world)
-        page = open_page(self.port, request, self.push_of)
+            build = partial(_in_world, Path(self.run), *self._chosen(self.run), self.world)
+        page = open_page(self.port)
         print(f"page: {page.url} (Ctrl-C ends it)", flush=True)
         try:
-            page.start(first)
+            page.start(build)
             page.run()
         except KeyboardInterrupt:
             print("page closed.")
         finally:
             page.close()
 
-    def push_of(self, request: PushRequest) -> Push:
-        """The push that the page asks for."""
-        case = dataclasses.replace(self.case, **request._asdict())
-        live = Live(pushes.build([case], self.setting), self.setting)
+    def push(self) -> Push:
+        """The options' push."""
+        case, law = self.case, self.case.named_law
+        label = law if isinstance(law, str) else registry.resolve_law(law)[0]
         scene = pushes.scene_of(case, self.setting)
-        return Push(live, scene, f"{pushes.title_of(case, scene)}, {request.law}")
+        live = Live(pushes.build([case], self.setting), self.setting)
+        return Push(live, scene, f"{pushes.title_of(case, scene)}, {label}")
 
 
 view = call_of(View)
-
-
-class PushRequest(NamedTuple):
-    """Object, friction, law and target of a push, as in the panel."""
-
-    object: str
-    friction: str  # as on the command line
-    law: str  # as on the command line
-    target: tuple[float, float]  # [m]
-
-
-Builder = Callable[[PushRequest], Push]
 
 
 def _in_world(run: Path, plan: Plan, law: str, index: int) -> Push:
@@ -169,12 +154,9 @@ def _in_world(run: Path, plan: Plan, law: str, index: int) -> Push:
 class Page:
     """The panel, the clock and what the browser asks for."""
 
-    def __init__(self, server: ViserServer, gate: Gate, request: PushRequest, build: Builder):
-        """Create a page without a push, whose panel shows a `request`.
-
-        `build` may raise InputError.
-        """
-        self._server, self._build_push = server, build
+    def __init__(self, server: ViserServer):
+        """Create a page without a push."""
+        self._server = server
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._closed = threading.Event()
         self._push: Push | None = None
@@ -184,28 +166,15 @@ class Page:
         self._playing, self._error = True, ""
         self._panel_due = 0.0  # [s] of the next update of the panel
         furnish(server)
-        self._add_controls(request)
-        inputs = server.gui._gui_input_handle_from_uuid
-        gate.rules = {
-            "ViewerCameraMessage": lambda message: True,
-            "GuiUpdateMessage": lambda m: accepts_update(inputs[m.uuid], m.updates),
-            **dict.fromkeys(_DRAGGING, lambda message: message.name == TARGET),
-        }
+        self._add_controls()
 
     @property
     def url(self) -> str:
         """URL of the page."""
         return f"http://{HOST}:{self._server.get_port()}"
 
-    @property
-    def request(self) -> PushRequest:
-        """The push that the panel shows."""
-        x, y = map(float, self._target.value)
-        return PushRequest(self._object.value, self._friction.value, self._law.value, (x, y))
-
     def start(self, build: Callable[[], Push]) -> None:
-        """Have `run` build another push and show it."""
-        self._again.disabled = True
+        """Have `run` build a push and show it."""
         self._status.content = (
             "The push is being prepared; the first of a shape takes some seconds."
         )
@@ -290,7 +259,6 @@ class Page:
         if self._error:
             lines.append(f"**Not possible:** {self._error}")
         self._status.content = "\n\n".join(lines)
-        self._again.disabled = False
         self._play.label = "Pause" if self._playing else "Play"
 
     def _state_text(self, live: Live) -> str:
@@ -325,7 +293,7 @@ class Page:
 
         register(note)
 
-    def _add_controls(self, request: PushRequest) -> None:
+    def _add_controls(self) -> None:
         """Build the panel."""
         gui = self._server.gui
         self._status = gui.add_markdown("")
@@ -338,18 +306,9 @@ class Page:
             hint = "0: ahead, 90: left of the robot"
             self._direction = gui.add_slider("towards [deg]", -180.0, 180.0, 5.0, 90.0, hint=hint)
             shove = gui.add_button("Shove")
-        with gui.add_folder("Another push"):
-            names, laws = tuple(objects.OBJECTS), dict.fromkeys((*registry.LAWS, request.law))
-            self._object = gui.add_dropdown("object", names, initial_value=request.object)
-            hint = "S1, S2 or ground,robot (as 0.25,0.4)"
-            self._friction = gui.add_text("friction", request.friction, hint=hint)
-            self._law = gui.add_dropdown("law", tuple(laws), initial_value=request.law)
-            self._target = gui.add_vector2("target [m]", request.target, step=0.1)
-            self._again = gui.add_button("Push", color=(13, 148, 141))
         self._connect(self._play.on_click, self._toggle)
         self._connect(self._time.on_update, self._seek)
         self._connect(shove.on_click, self._shove)
-        self._connect(self._again.on_click, self._push_again)
 
     def _toggle(self, _: Event) -> None:
         """Play or pause; restart a finished push."""
@@ -363,9 +322,6 @@ class Page:
             self._playing = False
             index = round(event.target.value / self._push.live.period)
             self._cursor = float(min(index, len(self._push.live.past) - 1))
-
-    def _push_again(self, _: Event) -> None:
-        self.start(partial(self._build_push, self.request))
 
     def _shove(self, _: Event) -> None:
         distance, angle = self._distance.value, math.radians(self._direction.value)
@@ -389,10 +345,10 @@ class Page:
             self._playing = True
 
 
-def open_page(port: int, request: PushRequest, build: Builder) -> Page:
+def open_page(port: int) -> Page:
     """Serve a page; InputError if viser is missing, or the port cannot be used."""
-    viser, gate = errors.require("viser", "viz"), Gate()
-    with contextlib.redirect_stdout(io.StringIO()), gate.guarding():  # it prints a panel
+    viser = errors.require("viser", "viz")
+    with contextlib.redirect_stdout(io.StringIO()), guarding():  # it prints a panel
         server = viser.ViserServer(HOST, port, verbose=False)
     try:
         if port not in (0, server.get_port()):  # viser takes another port if this one is used
@@ -401,4 +357,4 @@ def open_page(port: int, request: PushRequest, build: Builder) -> Page:
     except BaseException:
         server.stop()
         raise
-    return Page(server, gate, request, build)
+    return Page(server)

@@ -1,7 +1,7 @@
 """Bags of ROS 2: observations and commands of a law, in standard messages.
 
-`write` makes an MCAP file. `read` also reads sqlite3 (.db3), folders of `ros2 bag record`, and zstd
-compression. Each topic has one message per control step, except `/tf` and the markers:
+`write` makes an MCAP file. `read` also reads sqlite3 (.db3) and folders of `ros2 bag record`. Each
+topic has one message per control step, except `/tf` and the markers:
 
     /odom           nav_msgs/Odometry              pose of the base and its velocity in its frame
     /target         geometry_msgs/PointStamped     the law's target, on a path a lookahead ahead
@@ -26,29 +26,24 @@ Time is that of the header stamps. A topic whose messages have no stamp, or the 
 time of receipt less the median delay of the stamped topics; if their clock has another pace, as a
 simulation's, it is interpolated. The order of the file does not matter.
 
-The law needs target and object in the frame of the odometry, and contact and force in its child
-frame. `read` transforms them from other frames by `/tf`, `/tf_static` and the odometry, at their
-stamps. An empty frame is the one that the law needs.
+Target, path and object are in the frame of the odometry, and contact, force and command in its
+child frame. An empty frame is this one; other frames are refused.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import scipy
 
 from rps_jax import errors
 from rps_jax.errors import InputError
-from rps_jax.record import bag_storage, files, options
-from rps_jax.record.bag_storage import is_bag as is_bag
+from rps_jax.record import files, options
 from rps_jax.record.files import Arrays
 
 Message = dict[str, Any]  # fields of any type
@@ -58,13 +53,16 @@ TopicsLike = str | Mapping[str, str] | Sequence[str]  # names of topics: see `to
 _MAX_NUMBERS = 2**27  # of all messages, and of all steps; a message counts 32 more
 _MARKER_PERIOD = 1.0  # [s] between two target markers
 _STALE = 1.0  # [s] that a stream of messages may pause
-_EARLY = 0.1  # [s] before a transform that it holds
 _SKEW = 5e8  # [ns] of 80 % of the delays between stamp and receipt, or of 90 % of late stamps
 _DRIFT = 2e7  # [ns] change of the delay from the first to the last quarter of the messages
 _MAX_TILT = 0.1  # [rad] of the base against the floor
 _UNIT = 1e-3  # [1] by which the norm of a quaternion may differ from 1
-_SAME = 1e-6  # [m, rad] by which two frames may differ that are one
 _CORRECT = "cut the bag there, or correct the node that publishes it, or its clock (use_sim_time)"
+_SUFFIXES = (".mcap", ".db3", ".bag")
+_FIX = (
+    "give FILE.mcap, FILE.db3, or a folder of `ros2 bag record`; `mcap recover` and `ros2 bag "
+    "reindex` repair these, and `rosbags-convert` converts bags of ROS 1"
+)
 _NO_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
 
 
@@ -90,6 +88,11 @@ class Step(NamedTuple):
 def check() -> None:
     """Raise InputError unless the packages of the extra `bags` are installed."""
     _ = errors.require("mcap_ros2.writer", "bags"), errors.require("rosbags.typesys", "bags")
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path is a bag by its name, or a folder of `ros2 bag record`."""
+    return files.suffix_of(path) in _SUFFIXES or (path / "metadata.yaml").exists()
 
 
 # --- topics --------------------------------------------------------------------------------
@@ -120,9 +123,8 @@ def _xy(values: np.ndarray) -> np.ndarray:
     return values[:, :2]
 
 
-_TREE, _RARE = ("tf", "tf_static"), ("target", "goal", "path")  # _RARE: topics that are no streams
+_RARE = ("target", "goal", "path")  # topics that are no streams
 _POSITION = _floats("pose.position.xyz")
-_TF = {"tf2_msgs/TFMessage": _floats("transform.translation.xyz", "transform.rotation.xyzw")}
 _READERS: dict[str, dict[str, Callable[[RosMessage], Floats]]] = {  # of messages, by topic and type
     "odom": {"nav_msgs/Odometry": _floats("pose.pose.position.xyz", "pose.pose.orientation.xyzw")},
     "target": {
@@ -139,7 +141,6 @@ _READERS: dict[str, dict[str, Callable[[RosMessage], Floats]]] = {  # of message
         "geometry_msgs/TwistStamped": _floats("twist.linear.xy", "twist.angular.z"),
         "geometry_msgs/Twist": _floats("linear.xy", "angular.z"),
     },
-    **dict.fromkeys(_TREE, _TF),
 }
 _FIELDS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {  # of values (N, k)
     "pose": ("odom", _plane_pose),
@@ -156,6 +157,7 @@ _FIELDS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {  # of val
 }
 TOPICS = {f"/{key}": next(iter(readers)) for key, readers in _READERS.items()}  # types
 TOPICS |= dict.fromkeys(("/target_marker", "/walls"), TOPICS["/object"])
+TOPICS["/tf"] = "tf2_msgs/TFMessage"
 
 
 # --- writing -------------------------------------------------------------------------------
@@ -322,14 +324,14 @@ def read(
 def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> Arrays:
     """Return the steps of a bag, as `read` does."""
     names = {key: f"/{key}" for key in _READERS if key not in renamed} | renamed
-    logs, contents, faults = _collect(path, {k: names[k] for k in names if k not in _TREE})
+    logs, contents, faults = _collect(path, names)
     known = logs.keys() | faults.keys()
     goal = "path" if known & {"path", _END} and "target" not in known else "target"
     required = dict.fromkeys(["odom", goal, "cmd_vel", *renamed])
     missing = [
         f"{names[key]}{' with poses' if key == 'path' else ''}"
         for key in required
-        if key not in {*known, *_TREE}
+        if key not in known
     ]
     if not known & {"contact", "taxels"}:
         missing.append(f"{names['contact']} or {names['taxels']}")
@@ -364,8 +366,7 @@ def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> Arra
             late = commands.time - row.time > 1e9 * _STALE
             commands.refuse(late, f"no message on {row.topic} in the {_STALE:g} s before that")
         row.check(_MAX_TILT if key == "odom" else None)
-    edges = functools.cache(partial(_edges, path, names, logs["odom"], clock))
-    _to_frames(rows, edges, names["tf_static"])
+    _check_frames(rows)
     time = 1e-9 * commands.time
     return {
         "time": time,
@@ -422,6 +423,32 @@ class _Series(NamedTuple):
             self.refuse(tilt > max_tilt, f"a quaternion ({{}}) that tilts beyond {max_tilt} rad")
 
 
+def _entries(path: Path, topics: Collection[str]) -> Iterator[tuple[str, str, int, bytes | None]]:
+    """Yield all topics with their types, and then the messages of some, with the time of receipt.
+
+    Raises:
+      InputError: the path is no bag, or is damaged.
+    """
+    from rosbags.rosbag2 import Reader
+
+    try:
+        with Reader(path) as reader:
+            for x in reader.connections:
+                yield x.topic, x.msgtype.replace("/msg/", "/"), 0, None
+            if chosen := [x for x in reader.connections if x.topic in topics]:
+                for x, receipt, data in reader.messages(chosen):
+                    yield x.topic, x.msgtype.replace("/msg/", "/"), receipt, data
+    except Exception as error:  # of any kind, by the readers of a damaged file
+        heads = (x.open("rb").read(16) for x in (path, *path.glob("*")) if x.is_file())
+        fix = files.FETCH if any(x.startswith(files.POINTER) for x in heads) else _FIX
+        raise InputError(f"cannot be read ({_reason(error)}): {fix}") from error
+
+
+def _reason(error: Exception) -> str:
+    """Return what an error of a reader says, in one line."""
+    return " ".join(str(error).split())[:300].rstrip(".") or type(error).__name__
+
+
 def _collect(
     path: Path, names: Mapping[str, str]
 ) -> tuple[dict[str, _Log], set[str], dict[str, InputError]]:
@@ -429,10 +456,12 @@ def _collect(
 
     A topic with a fault lacks the messages after it.
     """
+    from rosbags.typesys import Stores, get_typestore
+
     keys = {name: key for key, slashed in names.items() for name in (slashed, slashed[1:])}
     logs, contents, faults = dict[str, _Log](), set[str](), dict[str, InputError]()
-    pairs, size = dict[_Pair, _Pair](), 0
-    for topic, kind, encoding, receipt, data in bag_storage.entries(path, keys):
+    pairs, size, store = dict[_Pair, _Pair](), 0, get_typestore(Stores.ROS2_HUMBLE)
+    for topic, kind, receipt, data in _entries(path, keys):
         if data is None:
             contents.add(f"{topic} ({kind})")
             continue
@@ -440,27 +469,25 @@ def _collect(
             continue
         readers = _READERS[key]
         try:
-            message = bag_storage.decoded(kind, encoding, data)
-            for part in getattr(message, "transforms", [message]):
-                values = np.array(readers[kind](part), float)
-                header = getattr(part, "header", _NO_HEADER)
-                stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
-                pair = header.frame_id.lstrip("/"), getattr(part, "child_frame_id", "").lstrip("/")
-                log = logs.setdefault(key if len(values) or key != "path" else _END, [])
-                log.append((np.int64(receipt), stamp, pairs.setdefault(pair, pair), values))
-                size += len(values) + 32
-                if (count := len(values)) != (first := len(log[0][3])):
-                    raise InputError(
-                        f"has a {kind} of {count} numbers on {topic} after one of {first}, "
-                        f"received at {receipt} ns: cut the bag there, or publish equally many"
-                    )
+            message: RosMessage = store.deserialize_cdr(data, kind.replace("/", "/msg/"))
+            values = np.array(readers[kind](message), float)
+            header = getattr(message, "header", _NO_HEADER)
+            stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
+            pair = header.frame_id.lstrip("/"), getattr(message, "child_frame_id", "").lstrip("/")
+            log = logs.setdefault(key if len(values) or key != "path" else _END, [])
+            log.append((np.int64(receipt), stamp, pairs.setdefault(pair, pair), values))
+            size += len(values) + 32
+            if (count := len(values)) != (first := len(log[0][3])):
+                raise InputError(
+                    f"has a {kind} of {count} numbers on {topic} after one of {first}, "
+                    f"received at {receipt} ns: cut the bag there, or publish equally many"
+                )
         except InputError as error:
             faults[key] = error
         except Exception as error:  # of any kind, by the readers of odd messages and types
             faults[key] = InputError(
-                f"has a {kind} in the encoding {encoding} on {topic} that cannot be decoded "
-                f"({bag_storage.reason(error)}), received at {receipt} ns: record "
-                f"{' or '.join(readers)} with ROS 2, or cut it out"
+                f"has a {kind} on {topic} that cannot be decoded ({_reason(error)}), received at "
+                f"{receipt} ns: record {' or '.join(readers)} with ROS 2, or cut it out"
             )
         _check_size(size)
     return logs, contents, faults
@@ -493,7 +520,7 @@ def _in_order(topic: str, log: _Log, clock: _Clock) -> _Series:
 
     Args:
       topic: their name.
-      log: the messages of the topic, or of one transform, in the order of the bag.
+      log: the messages of the topic in the order of receipt.
       clock: that of the stamped topics, or None.
 
     Raises:
@@ -505,95 +532,17 @@ def _in_order(topic: str, log: _Log, clock: _Clock) -> _Series:
     series = _Series(topic, time, values, np.array([row[2] for row in log], object))
     bad = (stamp == 0) & (clock is None and not stamp.any())
     series.refuse(bad, "no header stamp, nor times of receipt at the pace of other topics,")
-    # One of both orders may be wrong: files are reordered, and clocks of receivers jump.
-    if (np.diff(stamp[np.argsort(receipt, kind="stable")]) < 0).any():
-        series.refuse(np.append(False, np.diff(stamp) < 0), "a header stamp that goes back")
-    order = np.lexsort((receipt, time))
-    return series.at(order[np.append(np.diff(time[order]) > 0, True)])
+    series.refuse(np.append(False, np.diff(stamp) < 0), "a header stamp that goes back")
+    return series.at(np.append(np.diff(time) > 0, True))
 
 
-# --- frames --------------------------------------------------------------------------------
-
-
-_Edges = dict[_Pair, Callable[[], _Series]]  # transforms by the frames of parent and child
-
-
-def _edges(path: Path, names: Mapping[str, str], odom: _Log, clock: _Clock) -> _Edges:
-    """Return the transforms of a bag by the frames of parent and child."""
-    edges: dict[_Pair, tuple[str, _Log]] = {}
-    logs, _, faults = _collect(path, {key: names[key] for key in _TREE})
-    for fault in faults.values():
-        raise fault
-    for key, log in logs.items():
-        for row in log:
-            edges.setdefault(row[2], (names[key], []))[1].append(row)
-    edges[odom[0][2]] = names["odom"], odom
-    return {pair: partial(_in_order, *edge, clock) for pair, edge in edges.items()}
-
-
-def _to_frames(rows: Mapping[str, _Series], edges: Callable[[], _Edges], static: str) -> None:
-    """Transform points and forces, in place, into the frames that the law needs.
-
-    These are the frame of the odometry and its child frame. An empty frame is the right one.
-
-    Args:
-      rows: the messages at the commands, by the keys of topics.
-      edges: the transforms of the bag.
-      static: the topic whose transforms hold at any time.
-
-    Raises:
-      InputError: the bag has no transform, or commands are in another frame.
-    """
+def _check_frames(rows: Mapping[str, _Series]) -> None:
+    """Raise InputError for messages that are neither in the odometry's frame nor in its child's."""
     odom = rows["odom"]
     odom.refuse((odom.frames != odom.frames[0]).any(axis=1), "a change of frames")
     world, base = odom.frames[0][0] or "odom", odom.frames[0][1] or "base_link"
-    goals: dict[str, str] = dict.fromkeys(("target", "goal", "path", "object"), world)
-    goals |= dict.fromkeys(("contact", "force", "cmd_vel"), base)
-    for key in [key for key in goals if key in rows]:
-        row, goal = rows[key], goals[key]
-        for frame in sorted({*row.frames[:, 0]} - {"", goal}):
-            at = row.frames[:, 0] == frame
-            part = row.at(at)
-            matrices = _transform(part, frame, goal, edges(), static)
-            if key in ("cmd_vel", "goal"):
-                bad = abs(matrices - np.eye(4)).max(axis=(1, 2)) > _SAME
-                messages = "commands" if key == "cmd_vel" else "goals"
-                part.refuse(bad, f"the frame {frame}", f"publish {messages} in {goal}")
-            else:
-                size = part.values.shape[1] if key == "path" else 3
-                points = part.values[:, :size].reshape(len(part.values), -1, 3)
-                points = np.insert(points, 3, key != "force", axis=2)
-                moved = np.einsum("nij,nkj->nki", matrices, points)[..., :3]
-                row.values[at, :size] = moved.reshape(len(points), size)
-
-
-def _transform(row: _Series, frame: str, goal: str, edges: _Edges, static: str) -> np.ndarray:
-    """Return the matrices (N, 4, 4) from a frame to `goal`, at the times of messages."""
-    paths: dict[str, list[tuple[str, str]]] = {goal: []}  # the shortest, by their first frame
-    queue = [goal]
-    for node in queue:
-        for parent, child in edges:
-            neighbour = child if node == parent else parent
-            if node in (parent, child) and neighbour not in paths:
-                paths[neighbour] = [(parent, child), *paths[node]]
-                queue.append(neighbour)
-    if frame not in paths:
-        raise InputError(
-            f"has {row.topic} in the frame {frame}, and no transform from it to {goal}: record "
-            f"/tf and /tf_static, or publish it in {goal}"
-        )
-    matrices = np.eye(4)
-    for parent, child in paths[frame]:
-        series = edges[parent, child]()
-        poses = series.latest(row.time)
-        age = 1e-9 * (row.time - poses.time)
-        late = ((age > _STALE) | (age < -_EARLY)) & (series.topic != static)
-        row.refuse(late, f"no transform of {parent} to {child} at the time of the message")
-        poses.check(math.inf)
-        edge = np.tile(np.eye(4), (len(late), 1, 1))
-        rotations = scipy.spatial.transform.Rotation.from_quat(poses.values[:, 3:])
-        edge[:, :3, :3] = rotations.as_matrix()
-        edge[:, :3, 3] = poses.values[:, :3]
-        matrices = (np.linalg.inv(edge) if frame == parent else edge) @ matrices
-        frame = child if frame == parent else parent
-    return matrices
+    frames = dict.fromkeys(("target", "goal", "path", "object"), world)
+    frames |= dict.fromkeys(("contact", "force", "cmd_vel"), base)
+    for key in frames.keys() & rows.keys():
+        bad = (rows[key].frames[:, 0] != frames[key]) & (rows[key].frames[:, 0] != "")
+        rows[key].refuse(bad, f"a frame other than {frames[key]}", "publish it in that frame")

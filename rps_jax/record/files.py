@@ -36,7 +36,7 @@ _KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a desc
     "python": (2**22, "a Python file"),
     "xml": (2**24, "an MJCF file"),
     "policy": (2**28, "a policy's FILE.npz"),
-    "table": (2**28, "a table FILE.csv or FILE.parquet"),
+    "table": (2**28, "a table FILE.csv"),
     "part": (_MAX_PART, "the folder of a run"),
     "results": (2**37, "a file of results"),
 }
@@ -117,11 +117,6 @@ def write_results(path: Path, results: xr.Dataset) -> Path:
 def suffix_of(path: str | Path) -> str:
     """Return the suffix of a file name in lower case."""
     return Path(path).suffix.lower()
-
-
-def unpacked(path: Path) -> Path:
-    """Return the path of a file that may be compressed, without the suffix `.gz`."""
-    return path.with_suffix("") if suffix_of(path) == ".gz" else path
 
 
 def checksum_path(path: Path) -> Path:

@@ -7,16 +7,14 @@ positions of a contact are the first and the last along the shell's strip.
     sensor.init(key) -> state
     sensor.sense(state, footprint, period) -> (state, Reading)
 
-With a `temperature` a sensor is smooth: its reading has a contact weight from 0 to 1. As the
-temperature goes to zero, the reading tends to that without a temperature. The temperature has the
-unit of the threshold: [m] for an ideal sensor, for which 0.001 is a good value; [1], a relative
-change of capacitance, for a capacitive one, for which 0.03 is a good value. It must be well below
-the threshold, or the skin senses contact without an object.
+With a `temperature` a capacitive sensor is smooth: its reading has a contact weight from 0 to 1. As
+the temperature goes to zero, the reading tends to that without a temperature. The temperature is a
+relative change of capacitance [1], for which 0.03 is a good value. It must be well below the
+threshold, or the skin senses contact without an object.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -41,11 +39,9 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.base import normal
-from rps_jax.robot.shell import HALF_WIDTH, Row, Shell, side_lengths
+from rps_jax.robot.shell import HALF_WIDTH, Shell, side_lengths
 from rps_jax.spec import Named, Spec
 
-_NODES = 16  # points on each row of boards of the smooth ideal sensor
-_REACH = 8.0  # [1] temperatures beyond the tolerance at which the points end: weight 3e-4
 # [1] of an even contact: the least and the greatest signal over the mean, and the least mean.
 _EVEN, _PROUD, _PRESSED = 0.6, 1.35, 2.0
 _COVERED = 0.5  # [1] signal over that of the neighbour, of a taxel that the object covers
@@ -94,11 +90,6 @@ class IdealSkin(NamedTuple):
         2 * HALF_WIDTH / 12
     )
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
-    temperature: Annotated[
-        Parameter | None, Spec("m", "width of the smooth threshold", gt=0, le=1)
-    ] = None
-
-    SMOOTH = 0.001  # [m] a good temperature
 
     def check(self) -> None:
         """Raise InputError for fields that are no lengths."""
@@ -116,10 +107,13 @@ class IdealSkin(NamedTuple):
         del period
         if self.shell.radius is not None:
             return state, self._nearest(footprint)
-        if self.temperature is not None:
-            return state, self._smooth_reading(footprint, self.temperature)
         hits, positions = [], []  # of both ends of each row's interval, in strip order
-        for row, start, along, low, high, hit in self._crossings(footprint, self.tolerance):
+        for row in self.shell.rows():
+            start, along = (
+                jnp.asarray(x, footprint.vertices.dtype) for x in (row.start, row.along)
+            )
+            low, high = fp.crossing(footprint, start, along, self.tolerance)
+            hit = (low <= high) & (high >= 0) & (low <= row.length)
             for s in (low, high):
                 s = jnp.clip(s, 0.0, row.length)
                 positions.append(jnp.concatenate([start + s * along, row.offset + s[None]]))
@@ -143,56 +137,7 @@ class IdealSkin(NamedTuple):
         distance = -planar.greatest(-distances)
         # Within rounding errors, since a compiler may compute a distance twice.
         ends = (shell.on_strip(_extremes(distances <= distance + 1e-6, at)[0]),) * 2
-        if self.temperature is None:
-            return _reading(jnp.where(distance <= self.tolerance, POINT, NONE), *ends)
-        excess = (self.tolerance - distance) / self.temperature
-        return _smooth_reading(excess, jnp.asarray(POINT), *ends)
-
-    def _crossings(
-        self, footprint: Footprint, tolerance: Scalar
-    ) -> Iterator[tuple[Row, Array, Array, Array, Array, Array]]:
-        """Yield each row of boards, its start and direction, and its interval within `tolerance`.
-
-        The interval has two ends [m] along the row, and a flag: whether it meets the row.
-        """
-        dtype = footprint.vertices.dtype
-        for row in self.shell.rows():
-            start, along = jnp.asarray(row.start, dtype), jnp.asarray(row.along, dtype)
-            low, high = fp.crossing(footprint, start, along, tolerance)
-            yield row, start, along, low, high, (low <= high) & (high >= 0) & (low <= row.length)
-
-    def _smooth_reading(self, footprint: Footprint, temperature: Scalar) -> Reading:
-        """Return the reading of points whose activity is a sigmoid.
-
-        The activity of a point at signed distance x is sigmoid((tolerance - x) / temperature). The
-        contact is one run along the strip, also around a corner: its mean is the middle of its two
-        ends, its total activity their distance. The points lie where `footprint.crossing` finds a
-        face near enough and move with the object, so that a few suffice.
-        """
-        s, share = self._nodes(footprint, self.tolerance + _REACH * temperature)
-        distance = fp.signed_distance(footprint, self.shell.on_strip(s))
-        excess = (self.tolerance - distance) / temperature
-        # A softmax: also defined without contact, by the nearest point.
-        middle = jnp.sum(s * jax.nn.softmax(jax.nn.log_sigmoid(excess) + jnp.log(share)))
-        length = jnp.sum(share * jax.nn.sigmoid(excess))
-        first, last = self.shell.on_strip(middle + length * jnp.array([-0.5, 0.5], s.dtype))
-        kind = jnp.where(length > self.point_length, LINE, POINT)
-        return _smooth_reading(planar.greatest(excess), kind, first, last)
-
-    def _nodes(self, footprint: Footprint, tolerance: Scalar) -> Pair:
-        """Return points (N,) [m] of the strip within `tolerance` of a footprint, and their lengths.
-
-        A row of boards outside of the tolerance has points along its whole length.
-        """
-        middles = (np.arange(_NODES) + 0.5) / _NODES
-        nodes, shares = [], []
-        for row, _, _, low, high, near in self._crossings(footprint, tolerance):
-            low = jnp.where(near, jnp.clip(low, 0.0, row.length), 0.0)
-            high = jnp.where(near, jnp.clip(high, 0.0, row.length), row.length)
-            nodes.append(row.offset + low + (high - low) * middles)
-            share = jnp.maximum(high - low, 1e-6) / _NODES  # positive, for its logarithm
-            shares.append(jnp.broadcast_to(share, _NODES))
-        return jnp.concatenate(nodes), jnp.concatenate(shares)
+        return _reading(jnp.where(distance <= self.tolerance, POINT, NONE), *ends)
 
 
 class CapacitiveSkin(NamedTuple):
@@ -300,8 +245,9 @@ class CapacitiveSkin(NamedTuple):
         excess = jnp.where(state.alive, (state.signal - self.threshold) / temperature, _NEVER)
         middles = jnp.asarray(self.shell.taxels()[:, 0], excess.dtype)
         first, last = _first(excess) @ middles, _first(excess[::-1]) @ middles[::-1]
-        kind = jnp.clip(jnp.sum(excess > 0), POINT, LINE)
-        return _smooth_reading(planar.greatest(excess), kind, first, last)
+        # The weight is the greatest activity: 1/2 at the threshold.
+        kind = jnp.minimum(jnp.sum(excess > 0), LINE).astype(jnp.int32)
+        return Reading(kind, 0.5 * (first + last), jax.nn.sigmoid(planar.greatest(excess)))
 
 
 Skin = IdealSkin | CapacitiveSkin  # a pytree of parameters with two pure functions
@@ -466,12 +412,3 @@ def _reading(kind: jax.Array, first: jax.Array, last: jax.Array) -> Reading:
     """Return the reading of Sec. II-B: the location is the mean of the extreme positions."""
     location = jnp.where(kind == NONE, 0.0, 0.5 * (first + last))
     return Reading(kind.astype(jnp.int32), location, kind != NONE)
-
-
-def _smooth_reading(
-    excess: jax.Array, kind: jax.Array, first: jax.Array, last: jax.Array
-) -> Reading:
-    """Return a reading whose weight is the maximum activity: 1/2 at the threshold."""
-    in_contact = jax.nn.sigmoid(excess)
-    kind = jnp.where(excess > 0, kind, NONE)
-    return Reading(kind.astype(jnp.int32), 0.5 * (first + last), in_contact)

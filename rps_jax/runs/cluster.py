@@ -24,7 +24,6 @@ from types import ModuleType
 
 from rps_jax import errors
 from rps_jax.engines import device as devices
-from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import cache, provenance
 from rps_jax.record import folder as run_folder
@@ -115,7 +114,6 @@ def run_on_cluster(
     *,
     address: str,
     prepare: Callable[[], object],
-    gpus: bool = True,
     shard: Shard = Shard(),
     callback: ProgressCallback = no_progress,
     slots: int | None = None,
@@ -125,8 +123,8 @@ def run_on_cluster(
 
     Returned chunks are stored, whatever error ends the run, and `environment.json` names the
     workers. Each task calls `prepare` first, to choose its device and its cache of programs. It has
-    `workers` threads, by default one, and claims as many processors, and with `gpus` a GPU if the
-    cluster has any and the engine can use one.
+    `workers` threads, by default one, and claims as many processors, and a GPU if the cluster has
+    any and the engine can use one.
     """
     environment = devices.collect_environment() | {"slots": slots}
     missing, finished = execution.missing_chunks(folder, plan, shard)
@@ -138,8 +136,7 @@ def run_on_cluster(
         return
     threads, known = workers or 1, dict[tuple[str, int], JsonObject]()
     with connected(address) as ray:
-        gpu = gpus and plan.setting.simulator.traced
-        gpu = gpu and bool(ray.cluster_resources().get("GPU"))
+        gpu = plan.setting.simulator.traced and bool(ray.cluster_resources().get("GPU"))
         count = _count_workers(ray.nodes(), threads, int(gpu))
         # Otherwise the process of a GPU's task would end with the task, and compile again.
         options = {"max_calls": 0, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
@@ -180,25 +177,21 @@ def _divide(groups: Iterable[Sequence[int]], workers: int) -> Iterator[Sequence[
         yield from (chunks[i : i + size] for i in range(0, len(chunks), size))
 
 
-def on_cluster(address: str, device: Device) -> Callable[..., None]:
-    """Return a function that runs a plan on the workers of a cluster, each on this device."""
+def on_cluster(address: str) -> Callable[..., None]:
+    """Return a function that runs a plan on the workers of a cluster."""
     import jax
 
-    return functools.partial(
-        run_on_cluster,
-        address=address,
-        prepare=functools.partial(_prepare, device, bool(jax.config.jax_enable_x64)),
-        gpus=device in ("auto", "gpu"),
-    )
+    prepare = functools.partial(_prepare, bool(jax.config.jax_enable_x64))
+    return functools.partial(run_on_cluster, address=address, prepare=prepare)
 
 
-def _prepare(device: Device, x64: bool) -> None:
+def _prepare(x64: bool) -> None:
     """Configure the process of a worker as this process is configured."""
     import jax
 
     devices.configure_xla()
     jax.config.update("jax_enable_x64", x64)
-    devices.choose(device)
+    devices.choose("auto")
     cache.use_cache()
 
 

@@ -217,11 +217,7 @@ class TraceQuestion(Question[Trace]):
         return Bar(self.name, self.horizon, "simulated", shown=self.shows_progress)
 
     def report(self, results: Trace, run: Run) -> Sequence[Section]:
-        from rps_jax.analysis.mechanisms import describe  # imported late: it needs scipy.signal
-
         text = f"{results.summary}. Stepped by the engine {results.engine}."
-        if not results.outcome.success and (mechanisms := describe(results.data)):
-            text += f" Measured in the trace: {mechanisms}."
         return [Section("The push", text, (), Picture("trial", results.plot))]
 
 

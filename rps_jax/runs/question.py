@@ -56,7 +56,6 @@ from rps_jax.robot.robot import RobotLike, parse_robot
 from rps_jax.runs.run import Run
 from rps_jax.trials.progress import Bar, ProgressCallback, is_interactive
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import (
     Domain,
@@ -102,8 +101,15 @@ def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
 
 
 def current_names(command: object, values: Mapping[str, T]) -> dict[str, T]:
-    """Return values by the present names of fields of a command; warn of former names."""
+    """Return values by the present names of fields of a command; warn of former names.
+
+    Raises:
+      InputError: a field has been removed.
+    """
     current = dict(values)
+    for removed, instead in getattr(command, "REMOVED", {}).items():
+        if removed in current:
+            raise errors.InputError(f"the option {removed} has been removed: {instead}.")
     for former, name in getattr(command, "RENAMED", {}).items():
         if former in current:
             text = f"{former} of {snake_case(command.__name__)} will be removed: write {name}"
@@ -129,7 +135,7 @@ class Command(Generic[T]):
     """Callback that receives the progress instead of a bar."""
 
     QUICK: ClassVar[Mapping[str, object]] = {}  # values of `quick`, by the field's name
-    MOVED: ClassVar[Mapping[str, str]] = {}  # what replaces a former flag, by the flag
+    REMOVED: ClassVar[Mapping[str, str]] = {}  # what to do instead of former options, by name
     RENAMED: ClassVar[Mapping[str, str]] = {}  # present names of fields by their former ones
     # Fields of a class on which the answer does not depend, beside those of its base classes.
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("out", "progress", "report_to")
@@ -352,8 +358,8 @@ class BagQuestion(Question[T]):
 
     topics: TopicsLike = option((), flag="topic")
     """Topic of a bag that has another name, as odom=/ridgeback/odom; the option may be repeated.
-    The keys are odom, target, path, contact, taxels, force, object, cmd_vel, tf and tf_static. In
-    Python a dict: topics={"odom": "/ridgeback/odom"}."""
+    The keys are odom, target, path, contact, taxels, force, object and cmd_vel. In Python a dict:
+    topics={"odom": "/ridgeback/odom"}."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -369,7 +375,8 @@ class QuickQuestion(Question[T]):
         return quick_command(self, self) if self.quick else self
 
     def quick_note(self) -> str:
-        return quick_note(self) if self.quick else ""
+        text = "**This is a quick run**, which tests that the command works here: omit --quick."
+        return text * bool(self.quick and self.quick_values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -505,29 +512,6 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
 
 
 # --- small helpers of reports --------------------------------------------------------------
-
-
-def quick_note(question: Question[object]) -> str:
-    """Return the first line of the report of a quick run, or nothing if it has no quick values."""
-    names = question.quick_values()
-    values = (_value_in_words(name, attrgetter(name)(question)) for name in names)
-    if not names:
-        return ""
-    return (
-        f"**This is a quick run** ({'; '.join(values)}). It tests that the command works here; "
-        "for results leave out --quick."
-    )
-
-
-def _value_in_words(name: str, value: object) -> str:
-    """Return the name and the value of an option in words; of rules those that are changed."""
-    if isinstance(value, Rules):
-        defaults, values = Rules._field_defaults, value._asdict()
-        changed = {key: item for key, item in values.items() if item != defaults[key]}
-        return "; ".join(itertools.starmap(_value_in_words, changed.items()))
-    items = value if isinstance(value, tuple | list) else [value]
-    words = (name_or_custom(x) if isinstance(x, Domain) else str(x) for x in items)
-    return f"{name.rpartition('.')[2].replace('_', ' ')} {', '.join(words)}"
 
 
 def count_true(mask: np.ndarray) -> int:

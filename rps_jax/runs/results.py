@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from rps_jax.engines import device
@@ -23,10 +22,9 @@ from rps_jax.errors import InputError
 from rps_jax.record import files, options
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.files import Arrays
-from rps_jax.record.table import check_parquet
 from rps_jax.runs.plan import Plan, chunks_by_key, draw
 from rps_jax.spec import specs_of
-from rps_jax.trials.results import POSE, WORLD, labelled, variable
+from rps_jax.trials.results import POSE, WORLD, variable
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import Job, WorldBatch, drawn_worlds
@@ -215,48 +213,6 @@ def _prefetch(batches: Iterator[WorldBatch], count: int) -> Iterator[WorldBatch]
         while (worlds := queue.popleft().result()) is not None:
             queue.append(build())
             yield worlds
-
-
-def check_table(path: Path) -> None:
-    """Raise InputError unless a table can be written there: .csv, or .parquet with pyarrow."""
-    is_csv = files.suffix_of(files.unpacked(path)) == ".csv"
-    if not is_csv and files.suffix_of(path) != ".parquet":
-        raise InputError(f"table = {path} is not allowed: name a file NAME.csv or NAME.parquet.")
-    check_parquet("table", path)
-    if not path.parent.is_dir():
-        raise InputError(f"table = {path} is not allowed: {path.parent} is not a folder.")
-
-
-def write_table(results: xr.Dataset, path: Path) -> None:
-    """Write one row for each law and world of a sweep, as CSV or Parquet.
-
-    Columns are law, world, object, the outcomes (poses as base_x, base_y [m], base_yaw [rad], and
-    so on) and the drawn quantities. NAME.columns.csv has the unit and the meaning of each.
-    """
-    flat = results.reset_coords().drop_vars("pose", errors="ignore")
-    columns = {"object": results.object.variable}
-    for name, values in ((str(name), values) for name, values in flat.items()):
-        if values.dims == ("law", "world", "pose"):
-            body = name.removesuffix("_pose")
-            for i, (axis, unit) in enumerate({"x": "m", "y": "m", "yaw": "rad"}.items()):
-                meaning = f"{axis} of the {body} in the world at the end"
-                column = ("law", "world"), values.values[..., i], unit, meaning
-                columns |= labelled(**{f"{body}_{axis}": column})
-        elif set(values.dims) <= {"law", "world"}:
-            columns[name] = values.variable
-    labels = {name: (name, results[name].values, results[name].attrs) for name in ("law", "world")}
-    whole = xr.Dataset(columns, labels)
-    frame = whole.to_dataframe(dim_order=["law", "world"]).reset_index()
-    attrs = {str(name): whole[name].attrs for name in frame.columns}
-    rows = [
-        [name, attr.get("units", ""), attr.get("long_name", name.replace("_", " "))]
-        for name, attr in attrs.items()
-    ]
-    header = pd.DataFrame(rows, columns=["column", "unit", "meaning"])
-    write = frame.to_parquet if files.suffix_of(path) == ".parquet" else frame.to_csv
-    files.write_atomically(path, lambda partial: write(partial, index=False))
-    columns_path = files.unpacked(path).with_suffix(".columns.csv")
-    files.write_atomically(columns_path, lambda partial: header.to_csv(partial, index=False))
 
 
 def load(run: str | Path) -> xr.Dataset:

@@ -17,7 +17,6 @@ import xarray as xr
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.registry import LawsLike
-from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
@@ -34,8 +33,7 @@ from rps_jax.runs.question import (
     call_of,
     count_true,
 )
-from rps_jax.runs.results import Results, check_table, write_table
-from rps_jax.trials.progress import ProgressCallback
+from rps_jax.runs.results import Results
 from rps_jax.world import points
 from rps_jax.world.domain import task_in_words
 
@@ -138,11 +136,11 @@ class SweepOptions:
     ray: str | None = None
     """Run on the workers of a Ray cluster: auto, its HOST:PORT, or local (all of this host). Each
     worker claims a GPU, or else as many processors as workers, one by default."""
-    ray_device: Device = "auto"
-    """Device of the cluster's workers."""
-    table: Path | str | None = None
-    """File for a table with one row for each law and world: NAME.csv, or NAME.parquet (needs
-    pyarrow). NAME.columns.csv beside it has the units and meanings of the columns."""
+
+    REMOVED: ClassVar = {
+        "table": "write it by `rps_jax.load(RUN).drop_dims('pose').to_dataframe().to_csv(FILE)`",
+        "ray_device": "workers use GPUs unless `ray start --num-gpus 0` hides those of a host",
+    }
 
 
 @dataclass(frozen=True)
@@ -188,10 +186,6 @@ class Sweep(SweepOptions, PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQues
         sharded = self.parsed_shard.count > 1
         if self.points is not None and self.worlds is not None:
             raise InputError("worlds is not allowed with points: there is one world at each point.")
-        if self.table is not None:
-            if sharded:
-                raise InputError("table is not allowed with a shard: it needs all worlds.")
-            check_table(Path(self.table))
         if self.models and (self.ray or sharded):
             raise InputError("models is not allowed with ray or a shard: run it in one process.")
         if self.out is None and (self.ray or sharded):
@@ -206,7 +200,7 @@ class Sweep(SweepOptions, PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQues
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the plan; of a single shard, return its own trials (row)."""
-        execute = cluster.on_cluster(self.ray, self.ray_device) if self.ray else run_missing
+        execute = cluster.on_cluster(self.ray) if self.ray else run_missing
         inputs = self.plan, run.folder, self.parsed_shard
         outcomes = run_trials(*inputs, execute=execute, **run.batch_options)
         if "row" in outcomes.dims:
@@ -216,12 +210,6 @@ class Sweep(SweepOptions, PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQues
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         outcomes = super().labelled(outcomes, run)
         return model_panel.add_models(outcomes, self.plan, run) if self.models else outcomes
-
-    def execute(self, callback: ProgressCallback) -> xr.Dataset:
-        outcomes = super().execute(callback)
-        if self.table is not None:
-            write_table(outcomes, Path(self.table))
-        return outcomes
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         if "row" in results.dims:

@@ -12,10 +12,9 @@ import jax
 import numpy as np
 import xarray as xr
 from matplotlib.artist import setp
-from scipy import stats
 
 from rps_jax import errors
-from rps_jax.analysis import mechanisms, statistics, tables
+from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.paper import draw_path
 from rps_jax.analysis.figures.style import WIDTH, Figure, styled, tiles
 from rps_jax.questions import Picture, Plan, Run, Section, call_of, option
@@ -26,7 +25,6 @@ from rps_jax.runs.question import Question, Rows
 from rps_jax.trials import pushes
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import trace_dataset
-from rps_jax.world.domain import LABELS
 
 _COLUMNS = 4  # of maps, at most
 _PASSED = 0.8  # [1] share of a path before which its end is not near
@@ -39,28 +37,6 @@ def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
     near = (trials.min_distance < NEAR) & (trials.get("progress", 1.0) > _PASSED)
     timeouts = np.where(near, "timeout near the target", "timeout far from the target")
     return np.where(modes == "timeout", timeouts, modes)
-
-
-def common_quantities(trials: xr.Dataset, worlds: np.ndarray) -> list[tuple[str, float, float]]:
-    """Return the four drawn quantities, at most, in which some worlds differ most from all worlds.
-
-    The effect size is the probability that one of them has more of the quantity than another
-    world (the statistic of Mann and Whitney), less one half. Effects below 0.1 are left out.
-
-    Returns:
-      Names of quantities, with their medians over these worlds and over all worlds.
-    """
-    rows = []
-    for name in statistics.varied_quantities(trials):
-        values = trials[name].values.astype(float)
-        sample = values[worlds]
-        sample = sample[np.isfinite(sample)]
-        if sample.size < 3:
-            continue
-        more = stats.mannwhitneyu(sample, np.nan_to_num(values, nan=np.inf)).statistic
-        effect = abs(more / (sample.size * values.size) - 0.5)
-        rows.append((effect, (name, float(np.median(sample)), float(np.nanmedian(values)))))
-    return [medians for effect, medians in sorted(rows, reverse=True)[:4] if effect >= 0.1]
 
 
 @dataclass(frozen=True)
@@ -122,7 +98,7 @@ class Gallery(Question[xr.Dataset]):
 
     def intro(self, results: xr.Dataset) -> str:
         maps = "The maps show the outlines of base and object at the start (pale) and at the end."
-        return f"Run {self.run}: failure modes. {maps} {mechanisms.THRESHOLDS}"
+        return f"Run {self.run}: failure modes. {maps}"
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         plan, law = self.plan_and_law
@@ -138,9 +114,10 @@ class Gallery(Question[xr.Dataset]):
         for mode, indices in worlds.items():
             plotted = {i: traces[i] for i in indices[: self.each].tolist()}
             title = f"{law}: {mode}, {len(plotted)} of {indices.size} in {size} worlds"
-            text = _text(self.run, law, results, indices)
+            run_text, law_text = shlex.quote(str(self.run)), shlex.quote(law)
+            text = f"Example: `rps replay {run_text} {indices[0]} --law {law_text}`."
             picture = Picture(mode.replace(" ", "_"), partial(maps_figure, plotted, title))
-            rows = mechanism_table(plotted)
+            rows = trials_table(plotted)
             sections.append(Section(f"{mode}: {indices.size} of {size}", text, rows, picture))
         return sections
 
@@ -148,23 +125,12 @@ class Gallery(Question[xr.Dataset]):
 gallery = call_of(Gallery)
 
 
-def _text(run: str | Path, law: str, trials: xr.Dataset, worlds: np.ndarray) -> str:
-    """Return the sentences about the worlds of a mode: common quantities and replay command."""
-    parts = []
-    for name, sample, overall in common_quantities(trials, worlds):
-        unit = trials[name].attrs.get("units", "1").replace("1", "")
-        parts.append(f"{LABELS[name]} {sample:.2g} {unit}".rstrip() + f" (all: {overall:.2g})")
-    common = f"Medians: {', '.join(parts)}. " if parts else ""
-    command = f"rps replay {shlex.quote(str(run))} {worlds[0]} --law {shlex.quote(law)}"
-    return f"{common}Example: `{command}`."
-
-
 def _simulate(
     run: Path, plan: Plan, law: str, worlds: np.ndarray, progress: SequentialProgress
 ) -> Mapping[int, xr.Dataset]:
     """Return traces of trials of a law over time, by world; one batch for each object.
 
-    The attribute `differs` says whether a trial ends otherwise than in the sweep.
+    A warning names a trial that ends otherwise than in the sweep.
     """
     traces: dict[int, xr.Dataset] = {}
     objects = plan.object_of(worlds)
@@ -175,20 +141,17 @@ def _simulate(
         trajectories = pushes.record_batch(batch, plan.setting, **options)
         progress.finish(rows.size)
         outcomes = jax.tree.map(lambda *x: np.stack(x), *(x.outcome for x in trajectories))
-        differ = find_differences(run, law, rows.tolist(), outcomes)
-        for i, trajectory, differs in zip(rows.tolist(), trajectories, differ, strict=True):
-            traces[i] = trace_dataset(trajectory).assign_attrs(differs=bool(differs))
+        find_differences(run, law, rows.tolist(), outcomes)
+        traces |= dict(zip(rows.tolist(), map(trace_dataset, trajectories), strict=True))
     return traces
 
 
-def mechanism_table(traces: Mapping[int, xr.Dataset]) -> Rows:
-    """Return a row for the trace of each world: its end, and the mechanisms measured in it."""
-    rows = [["world", "end", "least distance", "path of the base", "measured"]]
+def trials_table(traces: Mapping[int, xr.Dataset]) -> Rows:
+    """Return a row for the trace of each world: its end, and the path of the base."""
+    rows = [["world", "end", "least distance", "path of the base"]]
     for world, trace in traces.items():
-        text = "ends otherwise than in the sweep; " * trace.attrs.get("differs", False)
-        text += mechanisms.describe(trace)
         end, path = float(trace.outcome_time), float(trace.outcome_path_length)
-        rows.append([str(world), f"{end:.0f} s", _miss(trace), f"{path:.1f} m", text or "-"])
+        rows.append([str(world), f"{end:.0f} s", _miss(trace), f"{path:.1f} m"])
     return rows
 
 

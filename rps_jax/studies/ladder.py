@@ -122,7 +122,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
         return None if rest else first
 
     def check(self) -> None:
-        for name in () if self.single else ("points", "table", "ray", "shard"):
+        for name in () if self.single else ("points", "ray", "shard"):
             if getattr(self, name) not in (None, "1/1"):
                 raise InputError(f"{name} is not allowed with several domains: name one domain.")
         for sweep in self.sweeps.values():

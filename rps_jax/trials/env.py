@@ -1,4 +1,4 @@
-"""Pushing as an environment for custom learning loops, with the interface of mujoco_playground.
+"""Pushing as an environment for custom learning loops, in the style of mujoco_playground.
 
     env = PushEnv("random_box")
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 512))
@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.control import soft
 from rps_jax.control.base import check_finite_leaves
 from rps_jax.control.laws import rps
@@ -39,10 +39,9 @@ from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Measurement, SingleWorld, Trial, World
 from rps_jax.trials.worlds import WorldBatch, drawn_scene, drawn_worlds, rows, soften_skins
-from rps_jax.world import domain, draws, objects, video
+from rps_jax.world import domain, draws, video
 from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 from rps_jax.world.draws import Draw
-from rps_jax.world.opengl import mujoco
 from rps_jax.world.scene import JOINTS, Scene
 from rps_jax.world.tasks import TaskLike
 from rps_jax.world.tasks.base import heading_of, is_relative
@@ -311,38 +310,6 @@ class PushEnv:
         """Control period [s]."""
         return self.setting.physics.control_period
 
-    @property
-    def sim_dt(self) -> float:
-        """Physics step [s]."""
-        return self.setting.physics.timestep
-
-    @property
-    def n_substeps(self) -> int:
-        """Physics steps in a control period."""
-        return self.setting.physics.substeps
-
-    @property
-    def unwrapped(self) -> PushEnv:
-        """This environment."""
-        return self
-
-    @property
-    def xml_path(self) -> str:
-        """Path of the MJCF file of the object, or of the family of a random one."""
-        known = self.object in objects.OBJECTS
-        return str(objects.path_of(self.object if known else self._alone.family_of(0)))
-
-    @property
-    def mj_model(self) -> mujoco.MjModel:
-        """Model of world 0, with its visual geoms."""
-        return self._scene(0).model
-
-    @property
-    def mjx_model(self) -> Any:
-        """Collision model of world 0, an `mjx.Model`, which the engine `mjx` steps."""
-        engine: Any = engines.get("mjx")
-        return engine.put_model(self._scene(0).physics)
-
     @functools.cached_property
     def _alone(self) -> Domain:
         ranges = domain.parse_domain(self.domain, self.robot, self.task)
@@ -368,14 +335,11 @@ class PushEnv:
         height: int = 240,  # [px]
         width: int = 320,  # [px]
         camera: str | None = None,
-        scene_option: None = None,  # unused
-        modify_scene_fns: None = None,  # unused
     ) -> Any:
         """Render images (height, width, 3) uint8 of states without a batch axis.
 
         The camera is oblique (the default) or above. One state gives one image.
         """
-        del scene_option, modify_scene_fns
         if isinstance(trajectory, State):
             return self.render([trajectory], height, width, camera)[0]
         if not isinstance(trajectory, Sequence):

@@ -25,26 +25,6 @@ claim("an outcome", *specs_of(Outcome), "law", "world")
 _TRACED = {**specs_of(Twist), **specs_of(Details)}  # numbers of a trace
 
 
-def nan_twists(results: xr.Dataset) -> str:
-    """Return a sentence on the trials in which a law returned a twist that is not finite.
-
-    It is empty if there are none; `results` are outcomes (..., law, ...), or those of one law.
-    """
-    if "nan_twist" not in results:
-        return ""
-    sentences = []
-    for law in results.law.values if "law" in results.dims else [None]:
-        trials = results if law is None else results.sel(law=law)
-        is_nan = trials.nan_twist.values > 0
-        if is_nan.any():
-            sentences.append(
-                f"{'The law' if law is None else law} returned a twist that is not finite (NaN or "
-                f"infinite) in {is_nan.sum()} of {is_nan.size} trials, first at "
-                f"{trials.time.values[is_nan].min():.2f} s; these trials ended there as diverged."
-            )
-    return " ".join(sentences)
-
-
 def outcome_dataset(
     outcome: Outcome,
     laws: Sequence[str],

@@ -17,8 +17,7 @@ The planner of `rps ceiling` minimises `plan_costs`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax.analysis import statistics
 from rps_jax.geometry.arrays import Number
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import check_fields, option
 from rps_jax.trials.trial import Outcome, Rules
 
@@ -36,16 +36,12 @@ _STILL = 0.002  # [rad] tilt without meaning: half of all pushes tilt their obje
 
 @dataclass(frozen=True)
 class Objective:
-    """Objective of tuners: the score of a trial, and the risk over worlds.
+    """Objective of tuners: the score of a trial, and its mean over worlds.
 
     A success scores its time; a failure scores one more, and the distance by which it missed the
     target. Both score the time without contact.
     """
 
-    risk: Literal["mean", "cvar"] = "mean"
-    """Risk: the mean over all worlds, or (cvar) the mean over the worst `tail` of them."""
-    tail: float = option(0.1, above=0, at_most=1)
-    """[1] Share of the worlds in the tail of cvar."""
     time: float = option(0.1, at_least=0)
     """[1] Score of a trial that takes the whole horizon."""
     lost: float = option(0.1, at_least=0)
@@ -81,24 +77,12 @@ class Objective:
         return np.asarray(self.score(success, time, lost, missed, rules), float)
 
     def value(self, scores: ArrayLike) -> jax.Array:
-        """Return the risk (...) of scores (..., W) over their worlds."""
-        scores = jnp.asarray(scores)
-        if self.risk == "mean":
-            return jnp.mean(scores, axis=-1)
-        worst = max(1, round(self.tail * scores.shape[-1]))
-        return jnp.mean(jnp.sort(scores, axis=-1)[..., -worst:], axis=-1)
+        """Return the mean (...) of scores (..., W) over their worlds."""
+        return jnp.mean(jnp.asarray(scores), axis=-1)
 
-    def linearise(self, scores: jax.Array) -> jax.Array:
-        """Return scores (..., W) whose mean has the gradient of the risk of scores (..., W).
-
-        For cvar these are the excess over the quantile, which is held (Rockafellar and Uryasev
-        2000, Eq. 4).
-        """
-        if self.risk == "mean":
-            return scores
-        held = jax.lax.stop_gradient(scores)
-        quantile = jnp.quantile(held, 1 - self.tail, axis=-1, keepdims=True)
-        return jnp.maximum(scores - quantile, 0.0) / self.tail
+    def to_json(self) -> JsonObject:
+        """Return the fields, with those of version 0.4, so that its runs are continued."""
+        return {"risk": "mean", "tail": 0.1} | asdict(self)
 
 
 def severity(

@@ -177,8 +177,15 @@ def _skin(domain: Domain, drawn: Draw) -> Skin:
 
 
 def soften_skins(worlds: World) -> World:
-    """Return worlds, or one, with smooth skins, unless these have a temperature."""
+    """Return worlds, or one, with smooth skins, unless these have a temperature.
+
+    Raises:
+      InputError: the skin is ideal, which has no smooth form.
+    """
     skin, shape = worlds.skin, jnp.shape(worlds.p_world_target)[:-1]
+    if isinstance(skin, IdealSkin):
+        rule = "an ideal skin has no smooth form; choose skin=capacitive, or smooth=False"
+        raise errors.not_allowed("smooth", True, rule)
     if skin.temperature is not None:
         return worlds
     return worlds._replace(skin=skin._replace(temperature=jnp.full(shape, skin.SMOOTH)))

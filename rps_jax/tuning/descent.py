@@ -92,8 +92,8 @@ class TuneGrad(Descent):
         "window_steps": 4,
     }  # fmt: skip
 
-    MOVED: ClassVar = dict.fromkeys(
-        ("--starts", "--spread"),
+    REMOVED: ClassVar = dict(Tuning.REMOVED) | dict.fromkeys(
+        ("starts", "spread"),
         "rps tune grad follows derivatives; the former random steps, from one start, are "
         "`rps tune es --estimator antithetic`",
     )
@@ -203,7 +203,7 @@ class TuneGrad(Descent):
         validation, *pairs = score(tried)
         slope = variance = np.nan
         for answer in pairs:
-            ahead, back = self.objective.linearise(jnp.asarray(answer.score))
+            ahead, back = jnp.asarray(answer.score)
             slopes = gradients.estimate((ahead - back)[:, None] / (2 * self.sigma))
             slope, variance = slopes.gradient[0], slopes.variance[0]
             if (ahead == back).all():
@@ -349,7 +349,7 @@ def _differentiate(
         steps = max(1, round(options.window / period))
         last, snapshots = trial.unroll(stage, worlds, params, states, loop, steps, native.mapped)
         scores = jax.vmap(cost, (1, 0, 0, 0, 0))(snapshots, worlds, params, states, last)
-        return jnp.sum(objective.linearise(scores))
+        return jnp.sum(scores)
 
     return jax.grad(total)(thetas)
 

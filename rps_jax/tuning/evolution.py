@@ -60,7 +60,7 @@ class Descent(Tuning):
         tried = self.tried(thetas.reshape(-1, count, vector.size), generation, worlds)
 
         def estimate(scores: CandidateScores) -> Estimate:
-            values = self.objective.linearise(jnp.ravel(jnp.asarray(scores.score)))
+            values = jnp.ravel(jnp.asarray(scores.score))
             slopes = gradients.estimate(gradients.slopes_along(steps, values, options))
             if missing := int(jnp.isnan(slopes.gradient).sum()):
                 warnings.warn(

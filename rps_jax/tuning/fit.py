@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -40,7 +40,6 @@ from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
 from rps_jax.record.files import Arrays, JsonObject
 from rps_jax.record.options import option
-from rps_jax.record.table import is_table
 from rps_jax.runs.push import Trace, recorded_law
 from rps_jax.runs.question import (
     BagQuestion,
@@ -109,10 +108,9 @@ class LogsQuestion(BagQuestion[Fitted], SimulationQuestion[Fitted]):
     """Logs of one object on one floor: tables FILE.csv (time, x, y, yaw, contact_type, contact_x,
     contact_y, v_x, v_y, omega, target_x, target_y and, if known, object_x, object_y, object_yaw,
     force_x, force_y, taxel_0, ...), bags FILE.mcap, run folders of rps push, or traces. Titles may
-    name other units than m, rad, s and N, as 'yaw [deg]'; a table may also be .parquet or .gz."""
-    columns: str | Mapping[str, str] = option("", kw_only=True)
-    """Titles of the tables' columns that have other names, as time=t,x=pose_x; a unit may follow a
-    title, as in 'yaw=heading [deg]'. In Python also a dict."""
+    name other units than m, rad, s and N, as 'yaw [deg]'."""
+
+    REMOVED: ClassVar = {"columns": "rename the columns of the table"}
 
 
 @dataclass(frozen=True)
@@ -137,7 +135,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     TITLE = "A domain fitted to logs"
     QUICK: ClassVar = {"worlds": 768, "window": 20.0}
     # The values of the logs matter.
-    IGNORED_FIELDS = ("logs", "topics", "columns")
+    IGNORED_FIELDS = ("logs", "topics")
 
     law: LawLike = "rps"
     worlds: int = option(6144, 96, 1_000_000)
@@ -152,11 +150,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         several = [logs] if isinstance(logs, str | Path | Trace) else list(logs)
         if not several:
             raise InputError("logs = () is not allowed: give at least one.")
-        paths = [Path(log) for log in several if not isinstance(log, Trace)]
-        if self.columns and not any(map(is_table, paths)):
-            raise errors.not_allowed("columns", self.columns, "no log is a table; omit it")
         robot = self.ranges.robot
-        raw = [logs_.read(log, robot.shell, self.topics, self.columns) for log in several]
+        raw = [logs_.read(log, robot.shell, self.topics) for log in several]
         for log in raw:
             log.columns["twist"] = robot.twist_of_middle(log.columns["twist"])
         return raw
@@ -236,13 +231,11 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
 
     def intro(self, results: Fitted) -> str:
         fields = self.observed[1]
-        conversions = dict.fromkeys(x for raw in self.raw_logs for x in raw.conversions)
-        converted = f" Converted: {', '.join(conversions)}." if conversions else ""
         return (
             f"Logs: {len(self.raw_logs)}, the first {self.bank.window:g} s of each at "
             f"{1 / self.bank.interval:.3g} Hz, with {', '.join(fields) or 'touch and odometry'}; "
             f"{self.num_trials()} worlds of the domain {self.domain}, "
-            f"{self.use_of_worlds}.{converted}"
+            f"{self.use_of_worlds}."
         )
 
     @property

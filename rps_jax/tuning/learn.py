@@ -20,7 +20,7 @@ from jax.stages import Lowered
 
 from rps_jax import errors
 from rps_jax.analysis import tables
-from rps_jax.analysis.figures.style import WIDTH, Axes, Figure, legend_above, styled, tiles
+from rps_jax.analysis.figures.style import WIDTH, Figure, legend_above, styled, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import policy as policies
@@ -385,38 +385,24 @@ class _Learner:
 
 @styled
 def figure_of(curve: xr.Dataset) -> Figure:
-    """Draw a learning curve: success and rewards against both clocks, and the state of PPO.
+    """Draw a learning curve: success against both clocks.
 
-    Thin lines are single updates; thick lines are means over 1/40 of the run.
+    The thin line has single updates; the thick line is a mean over 1/40 of the run.
     """
-    figure, axes = tiles(4, 2, (WIDTH / 2, 2.6), (0, 0))
-    clocks = (
-        (curve.time / 60, "wall clock, with compilation [min]"),
-        (curve.simulated / 3600, "simulated time, summed over worlds [h]"),
-    )
-    width = max(1, curve.sizes["update"] // 40)
-
-    def draw(ax: Axes, x: xr.DataArray, values: xr.DataArray, colour: str, label: str) -> None:
-        mean = values.rolling(update=width, min_periods=1, center=True).mean()
-        ax.plot(x, values, color=colour, lw=0.6, alpha=0.35)
-        ax.plot(x, mean, color=colour, lw=1.6, label=label)
-
-    valid = curve.validation.notnull().values
-    for ax, (x, _) in zip(axes[0], clocks, strict=True):
-        draw(ax, x, 100 * curve.success, "C0", "trials that ended, with noise, at the dotted level")
+    figure, axes = tiles(2, 2, (WIDTH / 2, 2.6), (0, 0))
+    width, valid = max(1, curve.sizes["update"] // 40), curve.validation.notnull().values
+    success = 100 * curve.success
+    mean = success.rolling(update=width, min_periods=1, center=True).mean()
+    for ax, x, label in (
+        (axes[0, 0], curve.time / 60, "wall clock, with compilation [min]"),
+        (axes[0, 1], curve.simulated / 3600, "simulated time, summed over worlds [h]"),
+    ):
+        ax.plot(x, success, color="C0", lw=0.6, alpha=0.35)
+        ax.plot(x, mean, color="C0", lw=1.6, label="trials that ended, with noise, at the level")
         ax.plot(x, 100 * curve.level, "k:", lw=1, label="level of the curriculum")
-        label = "validation: the domain itself, no noise"
-        ax.plot(x[valid], 100 * curve.validation[valid], "C3o-", ms=3, label=label)
-        ax.set(ylabel="success, level [%]", ylim=(-3, 103))
-    (minutes, _), (hours, _) = clocks
-    draw(axes[1, 0], minutes, curve.earned, "C2", "rewards of a trial that ended")
-    axes[1, 0].set_ylabel("rewards [1]")
-    axes[1, 1].plot(hours, curve.spread, label="standard deviation of the actions")
-    axes[1, 1].plot(hours, 100 * curve.learning_rate, label="100 learning rates")
-    axes[1, 1].plot(hours, curve.touching, label="share of decisions in contact")
-    axes[1, 1].set_ylabel("[1]")
-    for ax, (_, label) in zip(axes.flat, clocks * 2, strict=True):
-        ax.set_xlabel(label)
+        validation = "validation: the domain itself, no noise"
+        ax.plot(x[valid], 100 * curve.validation[valid], "C3o-", ms=3, label=validation)
+        ax.set(xlabel=label, ylabel="success, level [%]", ylim=(-3, 103))
         ax.grid(alpha=0.3)
         legend_above(ax, columns=1)
     return figure

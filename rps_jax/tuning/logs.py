@@ -1,8 +1,8 @@
 """Logs of pushes for `rps fit`: loaded, validated, resampled to one clock, and summarised.
 
 A log is one of these: a trace, which `push` and `replay` return or store in their run folder; a
-bag, which `rps push --bag` writes or a robot records (`record.bag` lists the topics); or a table,
-as CSV in the usual dialects or Parquet (see `record.table`), with a header and the columns
+bag, which `rps push --bag` writes or a robot records (`record.bag` lists the topics); or a table
+as CSV (see `record.table`), with the columns
 
     time                             [s]
     x, y, yaw                        [m, m, rad] of the base, by its odometry
@@ -17,7 +17,7 @@ as CSV in the usual dialects or Parquet (see `record.table`), with a header and 
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -27,13 +27,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax.errors import InputError, check_name, not_allowed
+from rps_jax.errors import InputError, not_allowed
 from rps_jax.geometry import planar
 from rps_jax.geometry.solid import rotate
-from rps_jax.record import bag, files
+from rps_jax.record import bag, files, table
 from rps_jax.record.files import Arrays
-from rps_jax.record.options import parse_names
-from rps_jax.record.table import Table, is_table
 from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import check_taxels, with_contacts
 from rps_jax.runs.push import Trace
@@ -59,17 +57,9 @@ _SLOWEST = 0.2  # [s] between two rows, at most
 _JUMPS = (0.5, 0.5, 1.0)  # [m, m, rad] between two rows, at least
 _RARE = 0.02  # share of jumps that are no error of the unit of x or y, at most
 _STILL = 0.001  # [m] that a target may move
-# Motion is compared with commands over windows, so that noise and delays matter little.
-_WINDOW = 2.0  # [s]
-_RESOLUTION = 0.05  # [m] and [rad] of both motions
-_MISFIT = 5.0  # greatest ratio of motion to command, as root mean squares
-_LOST = 0.08  # least ratio of the two; wheels may lose 90 %
-_ALIGNED = 0.7  # similarity of the two at least, if the base moves less than commanded
-_FRAMES = "yaw may be in deg or rise clockwise, or v_x and v_y may be in the frame of x and y"
 _FIX = "write SI units, or name the unit in the title of a table, as 'time [ms]' or 'yaw [deg]'"
 
 LogLike = Trace | str | Path
-NamesLike = str | Mapping[str, str]  # titles by names
 
 
 class Log(NamedTuple):
@@ -91,20 +81,16 @@ class RawLog(NamedTuple):
 
     columns: Arrays
     exact: bool  # the pose is the true one, not the one by odometry
-    rows: np.ndarray | None = None  # (N,) in the file of a table
-    conversions: Sequence[str] = ()  # of columns in other units, in words
+    rows: np.ndarray | None = None  # (N,) in a table
 
 
-def read(
-    source: LogLike, shell: Shell, topics: bag.TopicsLike = (), titles: NamesLike = ""
-) -> RawLog:
+def read(source: LogLike, shell: Shell, topics: bag.TopicsLike = ()) -> RawLog:
     """Load and validate one log, a trace or a path.
 
     Args:
       source: the log.
       shell: that of the robot.
       topics: other names of a bag's topics: see `bag.topic_names`.
-      titles: those of a table, by the names of its columns, as {"time": "t", "yaw": "a [deg]"}.
 
     Raises:
       InputError: the log cannot be read, lacks a column, is not of this robot, or not in its units.
@@ -119,8 +105,8 @@ def read(
         log = RawLog({k: np.asarray(v, float) for k, v in steps.items() if k in known}, False)
     elif path.is_dir():
         log = _from_trace(files.read_results(path), name)
-    elif is_table(path):
-        log = _from_table(path, name, parse_names("columns", titles))
+    elif files.suffix_of(path) in table.SUFFIXES:
+        log = _from_table(path, name)
     else:
         rule = "give a trace, a run folder of rps push, a table FILE.csv, or a bag FILE.mcap"
         raise not_allowed("log", path, rule)
@@ -165,28 +151,22 @@ def _unit_of(name: str) -> str | None:
     return _UNITS.get(name, "1" if _TAXEL.fullmatch(name) else None)
 
 
-def _from_table(path: Path, name: str, titles: Mapping[str, str]) -> RawLog:
+def _from_table(path: Path, name: str) -> RawLog:
     """Return the log of a table."""
-    for title in titles:
-        if _unit_of(title) is None:
-            check_name("column of a log", title, [*_UNITS, "taxel_0"])
-    table = Table(path, name, _unit_of, titles)
-    taxels = [title for title in table.columns if _TAXEL.fullmatch(title)]
-    signal = dict.fromkeys(sorted(taxels, key=lambda title: int(title[6:])), "1")
-    fields = COLUMNS | ({"signal": signal} if signal else {})
+    cells = table.read(path, name, _unit_of)
+    taxels = sorted(filter(_TAXEL.fullmatch, cells), key=lambda title: int(title[6:]))
     optional = (*OPTIONAL, *(_TOUCH if taxels else ()))
-    fields = {k: x for k, x in fields.items() if k not in optional or {*x} & {*table.columns}}
-    table.require(title for titles in fields.values() for title in titles)
-    columns = Arrays()
-    for key, titles in fields.items():
-        # Where there is no contact, its cells may be empty.
-        is_contact = key in ("p_robot_contact", "f_robot") and "contact_type" in columns
-        unused = columns["contact_type"] == 0 if is_contact else False
-        values = [table.values_of(title, unused) for title in titles]
-        columns[key] = values[0] if key in ("time", "contact_type") else np.stack(values, -1)
+    fields = {k: list(x) for k, x in (COLUMNS | {"signal": taxels}).items()}
+    fields = {k: x for k, x in fields.items() if k not in optional or {*x} & {*cells}}
+    table.require(cells, name, (title for titles in fields.values() for title in titles))
+    columns = {k: cells[x].to_numpy(float, copy=True) for k, x in fields.items()}
+    columns |= {k: columns[k][:, 0] for k in ("time", "contact_type") if k in columns}
+    for key in {"p_robot_contact", "f_robot"} & {*columns} if "contact_type" in columns else ():
+        unused = np.isnan(columns[key]) & (columns["contact_type"] == 0)[:, None]
+        columns[key] = np.where(unused, 0.0, columns[key])
     for key in {"pose", "object_pose"} & {*columns}:
         columns[key][:, 2] = np.unwrap(columns[key][:, 2])
-    return RawLog(columns, False, table.rows, table.conversions)
+    return RawLog(columns, False, cells.index.to_numpy())
 
 
 def _faults(log: RawLog) -> Iterator[str]:
@@ -223,39 +203,6 @@ def _faults(log: RawLog) -> Iterator[str]:
         change = " to ".join(f"{value:.3g}" for value in columns["pose"][i : i + 2, axis])
         change = f"{[*COLUMNS['pose']][axis]} from {change} in {at(i + 1)}"
         yield f"has a pose that jumps: {change}: cut the log there, or {_FIX}"
-    yield from motion_faults(time, columns["pose"], columns["twist"])
-
-
-def motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iterator[str]:
-    """Yield the contradictions of motion (N, 3) and commands (N, 3), by their units or frames.
-
-    A base that slips, lags, or is blocked for some time passes.
-    """
-    period = np.diff(time, append=time[-1])[:, None]
-    span = min(len(time) - 1, max(1, round(_WINDOW / float(np.median(period)))))
-    worlds = (rotate(yaw, twist) for yaw in (pose[:, 2], np.radians(pose[:, 2])))
-    integrals = (np.cumsum(x * period, axis=0) for x in (twist, *worlds))
-    moved, size, path, path_by_deg = (_over(x[None], span)[0] for x in (pose, *integrals))
-    for part, titles, units, commands, rates, least in (
-        (slice(2, 3), "yaw", "deg", "omega", "deg/s", -_ALIGNED),
-        (slice(2), "x and y", "mm or cm", "v_x and v_y", "mm/s or cm/s", 0.5),
-    ):
-        a, b = (np.linalg.norm(x[:, part]) / np.sqrt(len(x)) for x in (moved, size))
-        ratio = float(np.hypot(a, _RESOLUTION) / np.hypot(b, _RESOLUTION))
-        likeness, by_deg = (_similarity(moved[:, part], x[:, part]) for x in (path, path_by_deg))
-        if by_deg > max(0.9, likeness) and np.abs(pose[:, 2]).max() > 2 * np.pi:
-            least = 0.95
-        if ratio > _MISFIT or (ratio < _LOST and likeness > _ALIGNED):
-            suspect, unit = (titles, units) if ratio > 1 else (commands, rates)
-            fault = f"moves {ratio:.3g} times as far in {titles} as {commands} command"
-            yield f"has a base that {fault}: {suspect} may be in {unit}; {_FIX}"
-        elif likeness < least and 0.5 < ratio < 2:
-            yield f"has a base that does not move in the direction of {commands}: {_FRAMES}"
-
-
-def _similarity(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the cosine between vectors (N, k), of all entries together."""
-    return float(np.sum(a * b) / max(1e-12, np.linalg.norm(a) * np.linalg.norm(b)))
 
 
 def _unit_faults(columns: Arrays, shell: Shell) -> Iterator[str]:
@@ -264,7 +211,7 @@ def _unit_faults(columns: Arrays, shell: Shell) -> Iterator[str]:
     if not in_contact.any():
         yield "has no contact, so it has no information: log a push"
     object_pose = columns.get("object_pose", pose * [1, 1, 0])
-    turned = _over(object_pose[None, :, 2], round(_WINDOW / np.median(np.diff(columns["time"]))))
+    turned = _over(object_pose[None, :, 2], round(2.0 / np.median(np.diff(columns["time"]))))
     for titles, values, limit, unit in (
         ("v_x and v_y", columns["twist"][:, :2], 3.0, "m/s"),
         ("omega", columns["twist"][:, 2], 10.0, "rad/s"),

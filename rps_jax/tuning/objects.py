@@ -30,8 +30,8 @@ from rps_jax.analysis.report import Section
 from rps_jax.engines import finger
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry.arrays import Pair
+from rps_jax.record import table
 from rps_jax.record.options import option
-from rps_jax.record.table import Table
 from rps_jax.runs.question import Question, Rows, Run, call_of
 
 # Priors (mean, standard deviation) of the parameters; pressures are logarithms per unit of the
@@ -112,9 +112,12 @@ def read_pushes(pushes: PushesLike) -> Pushes:
     if isinstance(pushes, Pushes):
         return pushes
     name = "pushes" if isinstance(pushes, pd.DataFrame) else f"pushes = {pushes}"
-    table = Table(pushes, name, _COLUMNS.get)
-    table.require(_COLUMNS)
-    rows = np.column_stack([table.values_of(name) for name in _COLUMNS])
+    if not isinstance(pushes, pd.DataFrame):
+        pushes = table.read(Path(pushes), name, _COLUMNS.get)
+    table.require(pushes, name, _COLUMNS)
+    rows = pushes[list(_COLUMNS)].apply(pd.to_numeric, errors="coerce").to_numpy(float)
+    if not len(rows) or not np.isfinite(rows).all():
+        raise errors.not_allowed("pushes", "a table with gaps", "give finite numbers, m and rad")
     if abs(rows[:, [2, 3, 5, 6]]).max() > 50 or abs(rows[:, 4]).max() > 50:
         largest = f"numbers up to {abs(rows[:, 2:]).max():.3g}"
         raise errors.not_allowed("pushes", largest, "give x and y in m and yaw in rad")
@@ -464,9 +467,10 @@ class FitObject(Question[ObjectFit]):
         """Outline and pushes, read from their tables."""
         outline = self.outline
         if isinstance(outline, str | Path):
-            table = Table(outline, f"outline = {outline}", {"x": "m", "y": "m"}.get)
-            table.require(("x", "y"))
-            outline = np.column_stack([table.values_of("x"), table.values_of("y")])
+            name = f"outline = {outline}"
+            corners = table.read(Path(outline), name, {"x": "m", "y": "m"}.get)
+            table.require(corners, name, ("x", "y"))
+            outline = corners[["x", "y"]].to_numpy(float)
         return finger.check_outline(outline), read_pushes(self.pushes)
 
     def check(self) -> None:

@@ -83,6 +83,10 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         "slots": 64,
     }
 
+    REMOVED: ClassVar = dict.fromkeys(
+        ("objective.risk", "objective.tail"), "tuners minimise the mean over all worlds"
+    )
+
     law: LawLike = "rps"
     """Law with the initial parameters: a name, as rps, rps_tuned or rps_plus, or a file's class
     with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json."""

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import Law, RPSParams, register_law
-from rps_jax.control.observation import displacement
 from rps_jax.geometry import planar
 from rps_jax.laws import Bound, law_of, resolve_law
 
@@ -64,10 +63,10 @@ def step(params: Tables, state: Any, obs: Any, temperatures: Any = None) -> Any:
     is_plus = hasattr(params.rps, "law")
     rps, last = (params.rps.law, state.law) if is_plus else (params.rps, state)
     contact = jnp.where(jnp.asarray(obs.in_contact) > 0, obs.p_robot_contact, last.p_robot_contact)
-    filled = obs._replace(p_robot_contact=contact)
-    distance = jnp.maximum(planar.norm(displacement(filled)), _NEAR)
+    way = obs.p_world_target - (obs.p_world_robot + planar.rotate(obs.yaw, contact))
+    distance = jnp.maximum(planar.norm(way), _NEAR)
     u = jnp.log(distance / _NEAR) / jnp.log(_FAR / _NEAR)
-    v = jnp.abs(filled.l) / _WIDE
+    v = jnp.abs(obs._replace(p_robot_contact=contact).l) / _WIDE
     eta, gain = (jnp.exp(interpolate(x, u, v)) for x in (params.eta, params.K_h))
     changed = rps._replace(eta=rps.eta * eta, K_h=rps.K_h * gain)
     changed = params.rps._replace(law=changed) if is_plus else changed

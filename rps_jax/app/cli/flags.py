@@ -108,10 +108,14 @@ def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q
 
 
 def _current_flag(question_type: type[Q], word: str) -> str:
-    """Return a word of the command line, with the present name of a flag that was renamed."""
+    """Return a word of the command line, with the present name of a flag that was renamed.
+
+    Raises:
+      InputError: the flag was removed.
+    """
     flag, equals, value = word.partition("=")
     name = flag.removeprefix("--").replace("-", "_") if flag.startswith("--") else ""
-    if name not in question_type.RENAMED:
+    if name not in {**question_type.RENAMED, **question_type.REMOVED}:
         return word
     (current,) = current_names(question_type, {name: value})
     return f"--{current.replace('_', '-')}{equals}{value}"
@@ -122,9 +126,6 @@ def _parse(defaults: Q, command: str, words: Sequence[str]) -> tuple[Q, Session]
 
     def raise_sentence(event: _errors.ParseErrorEvent) -> None:
         known = [name for kind in kinds for name in _flag_names(kind)]
-        match event:
-            case _errors.UnrecognizedArgs(tokens=[token, *_]) if token in kinds[0].MOVED:
-                raise InputError(f"unknown option '{token}': {kinds[0].MOVED[token]}.")
         raise InputError(_sentence(event, command, known))
 
     with _errors.on_parse_error(raise_sentence):

@@ -196,11 +196,8 @@ def _report(question: Question[object], results: object, bar: Bar, film: list[Se
     """Write the report of the results, with the section of a film, and return its path."""
     while _importers:  # a module that two threads import at once may be incomplete in one
         _importers.pop().join()
-    import xarray as xr
-
     from rps_jax.analysis.report import write_report
     from rps_jax.record import provenance
-    from rps_jax.trials.results import nan_twists
 
     out = Path(str(question.out))
     bar.phase("report")
@@ -208,9 +205,6 @@ def _report(question: Question[object], results: object, bar: Bar, film: list[Se
     intro = [question.quick_note(), question.intro(results)]
     with contextlib.suppress(InputError):
         intro.append(provenance.describe(out))
-    if isinstance(results, xr.Dataset | xr.DataTree):
-        tree = xr.DataTree(results) if isinstance(results, xr.Dataset) else results
-        intro += [nan_twists(node.to_dataset()) for node in tree.subtree]
     return write_report(out, question.title, "\n\n".join(filter(None, intro)), sections)
 
 
