@@ -256,20 +256,24 @@ test_a_task_without_room_for_detours_is_refused = refusals(
 
 # --- the law -------------------------------------------------------------------------------
 
+SMALL = unicycle.Widths(1e-6, 1e-6, 1e-6)
 
-def follow(robot_facts, steps=6000):
+
+def follow(robot_facts, temperatures=None, steps=6000):
     """Run the law without an object: a touch at the start, and none later; return its path."""
     params = unicycle.UnicycleParams()
+    touch = jnp.asarray(True) if temperatures is None else jnp.ones(())
+    away = jnp.logical_not(touch) if temperatures is None else jnp.zeros(())
 
     def body(carry, step):
         state, pose = carry
         obs = observation(pose[:2], pose[2], [0.3625, 0.1], True, [0.0, -2.0])
-        obs = obs._replace(in_contact=step < 300, **robot_facts)
-        state, twist, _ = unicycle.step(params, state, obs)
+        obs = obs._replace(in_contact=jnp.where(step < 300, touch, away), **robot_facts)
+        state, twist, _ = unicycle.step(params, state, obs, temperatures)
         pose = pose + PERIOD * twist.in_world(pose[2])
         return (state, pose), (pose, jnp.stack(twist), state.around, state.align)
 
-    start = unicycle.init(params), jnp.zeros(3)
+    start = unicycle.init(params, temperatures), jnp.zeros(3)
     return jax.lax.scan(body, start, jnp.arange(steps))[1]
 
 
@@ -297,6 +301,11 @@ def test_after_a_lost_contact_the_base_drives_behind_the_object_and_faces_the_ta
     error = math.remainder(poses[end, 2] - math.atan2(*to_target[::-1]), 2 * math.pi)
     assert abs(error) < 0.6
     assert to_target @ behind < -0.8 * np.linalg.norm(to_target) * np.linalg.norm(behind)
+
+
+def test_the_smooth_law_tends_to_the_hard_one():
+    hard, smooth = (follow(FACTS["differential"], x, 1200)[0] for x in (None, SMALL))
+    np.testing.assert_allclose(smooth[:900], hard[:900], atol=1e-2)
 
 
 def stepped(contact, in_contact, base=0.0, **state):

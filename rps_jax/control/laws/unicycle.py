@@ -40,10 +40,10 @@ guess of M: first C; after more misses, in turn, a place where an object is not 
       or beside and behind the base, on the inside of the last detour, pushed along by its rear
 
 The twist is (v, a omega, omega), with |omega| <= |v| / R of a car. The law senses touch, odometry
-and target; axle and turning radius R are static facts.
+and target; axle and turning radius R are static facts. The smooth law mixes the four modes.
 """
 
-from functools import partial
+from functools import partial, reduce
 from typing import Annotated, NamedTuple
 
 import jax
@@ -120,8 +120,20 @@ class UnicycleParams(NamedTuple):
     ] = 0.85
 
 
+class Widths(NamedTuple):
+    """Widths of the switches of the smooth law; its choice of the side stays hard."""
+
+    length: Annotated[Parameter, Spec("m", "of lengths", gt=0, le=1)] = 0.01
+    angle: Annotated[Parameter, Spec("rad", "of angles", gt=0, le=1)] = 0.02
+    time: Annotated[Parameter, Spec("s", "of times", gt=0, le=1)] = 0.1
+
+    def check(self) -> None:
+        """Raise InputError for a width that is not positive."""
+        spec.check(self, "temperature ")
+
+
 class UnicycleState(NamedTuple):
-    """State of the law; without a mode, it pushes."""
+    """State of the law; the modes are bools, or weights of the smooth law, and no mode: push."""
 
     retreat: Annotated[jax.Array, Spec("1", "whether the base retreats")]
     around: Annotated[jax.Array, Spec("1", "whether it drives around the object")]
@@ -139,10 +151,10 @@ class UnicycleState(NamedTuple):
 check = partial(spec.check, prefix="unicycle.")
 
 
-def init(params: UnicycleParams) -> UnicycleState:
+def init(params: UnicycleParams, temperatures: Widths | None = None) -> UnicycleState:
     """Return the state before the first contact."""
     zero = jnp.zeros_like(jnp.asarray(params.r, float))
-    no = zero > 0
+    no = zero > 0 if temperatures is None else zero
     point = jnp.zeros(2, zero.dtype)
     return UnicycleState(no, no, no, point, point, zero, no, zero, no, zero + 1, zero)
 
@@ -153,21 +165,22 @@ class Contact(NamedTuple):
     touches: jax.Array
     p_robot: jax.Array  # (2,) [m]
     normal: jax.Array  # [rad] direction of the base's normal there, in its frame
-    on_front: jax.Array  # bool
+    on_front: jax.Array  # bool or weight
     half_length: Number  # [m] from the base's middle to its front
 
 
-def contact_of(p_world_last: jax.Array, obs: Observation) -> Contact:
+def contact_of(p_world_last: jax.Array, obs: Observation, widths: Widths | None = None) -> Contact:
     """Return the current contact, or the last one at `p_world_last` (2,) [m]."""
     touches = jnp.asarray(obs.in_contact)
     last = planar.rotate(-obs.yaw, p_world_last - obs.p_world_robot)
     point = soft.where(touches, obs.p_robot_contact, last)
     if obs.base_radius is not None:
         normal = planar.direction(point)
-        return Contact(touches, point, normal, jnp.abs(normal) < _ROUND_SIDE, obs.base_radius)
+        on_front = soft.greater(_ROUND_SIDE, jnp.abs(normal), widths and widths.angle)
+        return Contact(touches, point, normal, on_front, obs.base_radius)
     half_length = HALF_LENGTH if obs.half_length is None else obs.half_length
-    on_front = point[0] > half_length - _SIDE
-    normal = jnp.where(on_front, 0.0, jnp.sign(point[1]) * jnp.pi / 2)
+    on_front = soft.greater(point[0], half_length - _SIDE, widths and widths.length)
+    normal = soft.where(on_front, 0.0, jnp.sign(point[1]) * jnp.pi / 2)
     return Contact(touches, point, normal, on_front, half_length)
 
 
@@ -182,7 +195,7 @@ class Way(NamedTuple):
     """Way around the object, D6."""
 
     side: jax.Array  # [1] 1: counter-clockwise, or -1
-    is_direct: jax.Array  # bool: whether W is the staging point
+    is_direct: jax.Array  # bool or weight: whether W is the staging point
     staging: jax.Array  # (2,) [m]
     aim: jax.Array  # (2,) [m] W
 
@@ -210,49 +223,66 @@ def way_around(
     radius: Number,  # [m] of the circle
     distance: Number,  # [m] of the staging point from M
     ahead: Number,  # [rad] of the aim on the circle
+    width: Number | None = None,  # [rad] of the smooth switch
 ) -> Way:
     """Compute D6: the point that the base drives to, on its way to the staging point."""
     phi, turn, side = turn_around(psi, offset, side, chooses)
-    is_direct = turn < ahead
+    is_direct = soft.greater(ahead, turn, width)
     staging = middle - distance * planar.unit(psi)
     carrot = middle + radius * planar.unit(phi + side * ahead)
-    return Way(side, is_direct, staging, jnp.where(is_direct, staging, carrot))
+    return Way(side, is_direct, staging, soft.where(is_direct, staging, carrot))
+
+
+def _either(*conditions: jax.Array) -> jax.Array:
+    """Return whether one of several conditions holds that exclude each other; a sum of weights."""
+    return reduce(lambda a, b: a | b if a.dtype == b.dtype == bool else a + b, conditions)
+
+
+def _is(condition: jax.Array) -> jax.Array:
+    """Return a condition as a bool."""
+    return condition if condition.dtype == bool else condition > 0.5
 
 
 def step(
-    params: UnicycleParams, state: UnicycleState, obs: Observation
+    params: UnicycleParams,
+    state: UnicycleState,
+    obs: Observation,
+    temperatures: Widths | None = None,
 ) -> tuple[UnicycleState, Twist, Details]:
-    """Compute one control step."""
+    """Compute one control step; with `temperatures`, the modes and the contact are weights."""
+    length, angle, time = temperatures or (None, None, None)
+    above, and_, or_, not_, where = soft.greater, soft.and_, soft.or_, soft.not_, soft.where
     axle = jnp.asarray(0.0 if obs.axle is None else obs.axle)
     yaw = jnp.asarray(obs.yaw)
     u = planar.unit(yaw)
     p_world_axle = obs.p_world_robot - axle * u
-    push = ~(state.retreat | state.around | state.align)
-    touches, contact, normal, on_front, half_length = contact_of(state.p_world_contact, obs)
-    touched = state.touched | touches
+    push = not_(_either(state.retreat, state.around, state.align))
+    current = contact_of(state.p_world_contact, obs, temperatures)
+    touches, contact, normal, on_front, half_length = current
+    touched = or_(state.touched, touches)
     sensed = obs._replace(p_robot_contact=contact)
-    l = jnp.where(touches, sensed.l, state.l)  # noqa: E741
+    l = where(touches, sensed.l, state.l)  # noqa: E741
 
     # D1, and the guess D9 after an approach that passes M without contact.
     p_world_contact = obs.p_world_robot + planar.rotate(yaw, contact)
     ahead, last = params.r * planar.unit(yaw + normal), state.p_world_object - p_world_contact
-    is_steady = state.pushed | ~state.touched
-    ahead = planar.direction(jnp.where(is_steady, ahead, ahead + last))
+    is_steady = or_(state.pushed, not_(state.touched))
+    ahead = planar.direction(where(is_steady, ahead, ahead + last))
     middle = p_world_contact + params.r * planar.unit(ahead)
-    middle = jnp.where(touches, middle, state.p_world_object)
-    t_lost = jnp.where(touches, 0.0, state.t_lost + obs.period)
-    pushed, is_new = push & (state.pushed | touches), ~state.pushed
+    middle = where(touches, middle, state.p_world_object)
+    t_lost = where(touches, 0.0, state.t_lost + obs.period)
+    pushed, is_new = and_(push, or_(state.pushed, touches)), not_(state.pushed)
     front = obs.p_world_robot + half_length * u
-    past = jnp.sum((front - middle) * u) > _PAST
-    missed = push & touched & is_new & ~touches & past
+    past = above(jnp.sum((front - middle) * u), _PAST, length)
+    missed = and_(and_(and_(push, touched), and_(is_new, not_(touches))), past)
     small, is_odd = jnp.abs(state.l) < _MIDDLE, jnp.mod(state.misses, 2) > 0.5
     beside = jnp.stack([jnp.full_like(yaw, -_BESIDE[0]), -_BESIDE[1] * state.side])
     beside = obs.p_world_robot + planar.rotate(yaw, beside)
     guess = jnp.where(small ^ is_odd, beside, front + params.r * u)
     first = state.misses < 0.5
-    middle = jnp.where(missed, jnp.where(first, p_world_contact, guess), middle)
-    p_world_contact = jnp.where(missed & ~first, front, p_world_contact)
-    misses = jnp.where(touches, 0.0, jnp.where(missed, state.misses + 1, state.misses))
+    middle = where(missed, jnp.where(first, p_world_contact, guess), middle)
+    p_world_contact = where(missed, jnp.where(first, p_world_contact, front), p_world_contact)
+    misses = where(touches, 0.0, where(missed, state.misses + 1, state.misses))
 
     # D2 and D3.
     d = displacement(sensed)
@@ -260,47 +290,53 @@ def step(
     psi = push_direction(middle, p_world_axle, obs.p_world_target, params.r)
 
     # The end of a push.
-    near = params.d_near > distance
-    spent = (jnp.abs(l) > params.l_edge) | (jnp.abs(e) > params.e_far)
-    spent = jnp.where(near, jnp.abs(e) > params.e_near, spent) | ~on_front
-    is_lost = (t_lost > params.t_lost) & ~is_new
-    is_finished = push & touched & ((touches & spent) | is_lost | missed)
+    near = above(params.d_near, distance, length)
+    spent_near = above(jnp.abs(e), params.e_near, angle)
+    spent = or_(above(jnp.abs(l), params.l_edge, length), above(jnp.abs(e), params.e_far, angle))
+    spent = where(near, spent_near, spent)
+    spent = or_(spent, not_(on_front))
+    is_lost = and_(above(t_lost, params.t_lost, time), not_(is_new))
+    is_finished = and_(and_(push, touched), or_(or_(and_(touches, spent), is_lost), missed))
 
     # D6: the side is chosen before the base leaves, and kept on the way.
-    offset, chooses = p_world_axle - middle, push | state.retreat
+    offset, chooses = p_world_axle - middle, _is(or_(push, state.retreat))
     radii = params.R + axle, params.R_s + axle
     circle = middle, psi, offset, state.side, chooses, *radii, params.carrot
-    side, is_direct, staging, aim = way_around(*circle)
+    side, is_direct, staging, aim = way_around(*circle, angle)
     error = planar.wrap(planar.direction(aim - p_world_axle) + jnp.pi - yaw)
     remaining = planar.norm(staging - p_world_axle)
-    passed = (remaining < _CLOSE) & (jnp.abs(error) > _BEARING)
-    is_there = is_direct & ((remaining < _ARRIVED) | passed)
+    passed = and_(above(_CLOSE, remaining, length), above(jnp.abs(error), _BEARING, angle))
+    is_there = and_(is_direct, or_(above(_ARRIVED, remaining, length), passed))
     face = planar.wrap(psi - yaw)
 
     # The next modes. A touch of the middle of the front on the way is a push, unless it is spent.
-    aligned = jnp.abs(face) < _ALIGNED
-    hits = touches & on_front & (jnp.abs(l) < _MIDDLE)
-    stops = touches & (contact[0] > half_length - _CORNER) & (~hits | spent)
-    arrives = hits | stops
+    aligned, in_middle = above(_ALIGNED, jnp.abs(face), angle), above(_MIDDLE, jnp.abs(l), length)
+    hits = and_(and_(touches, on_front), in_middle)
+    is_corner = above(contact[0], half_length - _CORNER, length)
+    stops = and_(and_(touches, is_corner), or_(not_(hits), spent))
+    arrives = or_(hits, stops)
     clearance = planar.norm(p_world_contact - obs.p_world_robot) - half_length
-    is_clear = clearance > params.back
-    stopped = (state.around | state.align) & stops
-    retreat = is_finished | stopped | (state.retreat & ~is_clear)
-    around = (state.retreat & is_clear) | (state.around & ~is_there & ~arrives)
-    align = ((state.around & is_there) | (state.align & ~aligned)) & ~arrives
+    is_clear = above(clearance, params.back, length)
+    stopped = and_(_either(state.around, state.align), stops)
+    retreat = _either(is_finished, stopped, and_(state.retreat, not_(is_clear)))
+    leaves = and_(state.retreat, is_clear)
+    around = _either(leaves, and_(and_(state.around, not_(is_there)), not_(arrives)))
+    align = _either(and_(state.around, is_there), and_(state.align, not_(aligned)))
+    align = and_(align, not_(arrives))
 
     # D4, D5, D7 and D8.
     v_max, least = jnp.asarray(params.v_max), obs.turning_radius
     far = params.K_e * e + params.K_l * (l - jnp.clip(l, -params.l_dead, params.l_dead))
     arm = jnp.maximum(contact[0], _LEAST_ARM) + axle
-    steer = jnp.where(near, params.K_near * v_max * jnp.sin(e) / arm, far)
+    steer = where(near, params.K_near * v_max * jnp.sin(e) / arm, far)
     approach = planar.wrap(planar.direction(middle - p_world_axle) - yaw)
-    steer = jnp.where(touches, steer, jnp.where(is_new & touched, approach, 0.0))
+    steer = where(touches, steer, where(and_(is_new, touched), approach, 0.0))
     on_spot = 0.0 if least is None else -v_max
-    drive = jnp.where(jnp.abs(error) > _LARGE, on_spot, -v_max * jnp.cos(error))
-    v = jnp.where(around, drive, jnp.where(touched, v_max, params.v_approach))
-    v = jnp.where(align, on_spot, jnp.where(retreat, -v_max, v))
-    omega = jnp.where(align, face, jnp.where(around | retreat, error, steer))
+    is_large = above(jnp.abs(error), _LARGE, angle)
+    drive = where(is_large, on_spot, -v_max * jnp.cos(error))
+    v = where(around, drive, where(touched, v_max, params.v_approach))
+    v = where(align, on_spot, where(retreat, -v_max, v))
+    omega = where(align, face, where(or_(around, retreat), error, steer))
     omega = jnp.clip(omega, -jnp.asarray(params.omega_max), params.omega_max)
     bound = planar.safe_sqrt(jnp.maximum(v_max**2 - (axle * omega) ** 2, 1e-8))
     v = jnp.clip(v, -bound, bound)
@@ -309,15 +345,16 @@ def step(
     memory = UnicycleState(
         retreat, around, align, middle, p_world_contact, l, touched, t_lost, pushed, side, misses
     )
-    details = Details(l, distance, jnp.zeros_like(distance), e, retreat | around | align)
+    details = Details(l, distance, jnp.zeros_like(distance), e, _either(retreat, around, align))
     return memory, Twist(v, axle * omega, omega), details
 
 
 def memory(state: UnicycleState) -> Memory:
     """Return the mode and the middle M of the object."""
-    modes = zip((state.retreat, state.around, state.align), MODES, strict=True)
-    mode = next((words for is_active, words in modes if is_active), "")
-    return Memory(mode, state.p_world_object) if state.touched else Memory(mode)
+    weights = state.retreat, state.around, state.align
+    modes = zip(weights, MODES, strict=True)
+    mode = next((words for weight, words in modes if weight > 0.5), "")
+    return Memory(mode, state.p_world_object) if state.touched > 0.5 else Memory(mode)
 
 
 LAW = Law(
@@ -325,6 +362,7 @@ LAW = Law(
     step,
     check=check,
     bounds=bounds_of(UnicycleParams),
+    temperatures=Widths(),
     drives=("omni", "differential", "car"),
     room=1.0,
     memory=memory,
