@@ -1,6 +1,7 @@
 """Sweeps over random worlds: worlds are independent, and finished work is never lost."""
 
 import errno
+import gc
 import json
 import multiprocessing
 import os
@@ -43,7 +44,7 @@ from rps_jax.geometry import planar
 from rps_jax.record import cache, files
 from rps_jax.runs import sweep
 from rps_jax.runs.plan import Shard, load_plan, open_run
-from rps_jax.runs.results import store_chunk
+from rps_jax.runs.results import PlanRequest, Results, store_chunk
 from rps_jax.runs.sweep import merge
 from rps_jax.trials import batch, trial
 from rps_jax.trials.trial import Rules
@@ -322,6 +323,12 @@ def test_a_fault_loses_nothing(fault, whole, tmp_path, capsys, monkeypatch):
     assert continued(tmp_path, whole) == sum(sizes)
 
 
+def test_programs_load_while_most_worlds_are_built():
+    plan = replace(PLAN, worlds=100, part=70)
+    (job,) = PlanRequest(plan, list(plan.chunks), Results(plan)).jobs(SHORT)
+    assert [batch.indices.size for batch in job.batches] == [64, 6, 30, 70, 30]  # of two laws
+
+
 def test_only_a_corrupt_part_is_set_aside_and_repeated(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
     victim = sorted(folder.glob("parts/*.npz"))[2]
@@ -403,7 +410,10 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
         "rps",
         f"rps,{tuned}",
     ]
+    gc.disable()  # as a process starts
     assert [rps(*command, "--shard", f"{k}/2") for k in (1, 2)] == [0, 0]
+    assert gc.isenabled()
+    gc.unfreeze()
     text = printed(capsys, "merge", run, "--out", run)
     assert "rps,tuned against rps" in text
     results = files.read_results(run)

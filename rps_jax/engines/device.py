@@ -47,24 +47,14 @@ def has_started() -> bool:
     return bridge is not None and bridge.backends_are_initialized()
 
 
-class _Fork:
-    """Whether this process is the fork of one in which JAX had started."""
-
-    broken = False
-
-    @classmethod
-    def note(cls) -> None:
-        """Note that this process was forked."""
-        cls.broken = cls.broken or has_started()
-
-
+_forks = list[bool]()  # whether JAX had started, for each fork that led to this process
 if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_Fork.note)
+    os.register_at_fork(after_in_child=lambda: _forks.append(has_started()))
 
 
 def check_process() -> None:
     """Raise InputError in the fork of a process in which JAX had started: it would hang."""
-    if _Fork.broken:
+    if any(_forks):
         raise InputError(
             "this process is a fork of one in which JAX runs, whose threads it lacks, so that it "
             "would hang: start workers with the context 'spawn', as multiprocessing.get_context"
@@ -95,11 +85,17 @@ def standard_jax() -> Iterator[None]:
 
     with contextlib.ExitStack() as stack:
         for context in (
-            jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"),
-            jax.transfer_guard("allow"), jax.disable_jit(False), jax.no_tracing(False),
-            jax.debug_nans(False), jax.debug_infs(False), jax.check_tracer_leaks(False),
-            jax.legacy_prng_key("allow"), jax.enable_custom_prng(False),
-        ):  # fmt: skip
+            jax.numpy_dtype_promotion("standard"),
+            jax.numpy_rank_promotion("allow"),
+            jax.transfer_guard("allow"),
+            jax.disable_jit(False),
+            jax.no_tracing(False),
+            jax.debug_nans(False),
+            jax.debug_infs(False),
+            jax.check_tracer_leaks(False),
+            jax.legacy_prng_key("allow"),
+            jax.enable_custom_prng(False),
+        ):
             stack.enter_context(context)
         yield
 

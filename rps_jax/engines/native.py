@@ -63,9 +63,6 @@ if platform.machine() in ("x86_64", "AMD64"):  # GCC splits vectors where it pre
     _FLAGS += ("-mprefer-vector-width=512",)
 _NAME = "rps_native_"
 _THREADS = (4, 16)  # of a GPU that compute a world: the second if shared memory is short
-_NO_COMPILER = (
-    "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not installed"
-)
 _PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
 libraries: dict[str, ctypes.CDLL] = {}  # of the functions that XLA can call, by name
 # Compilers run while JAX traces the next functions.
@@ -85,11 +82,14 @@ def is_available() -> bool:
     """
     if jax.config.jax_enable_x64 or vectors.ONE_WORLD.get():
         return False
-    compiler = target()
-    on_gpu = jax.default_backend() == "gpu"
-    if compiler is None and on_gpu and os.environ.get("RPS_COMPILER") != "none":
-        warnings.warn(f"{_NO_COMPILER}, so XLA compiles, which is much slower", stacklevel=2)
-    return compiler is not None
+    if target() is not None:
+        return True
+    if jax.default_backend() == "gpu" and os.environ.get("RPS_COMPILER") != "none":
+        missing = "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc)"
+        warnings.warn(
+            f"{missing} is not installed, so XLA compiles, which is much slower", stacklevel=2
+        )
+    return False
 
 
 @functools.cache
@@ -481,11 +481,10 @@ def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
     Raises:
       TooLargeError: a kernel needs too much shared memory.
     """
-    *fewer, most = _THREADS
-    for threads in fewer:
-        with contextlib.suppress(TooLargeError):
-            return threads, _printed(functions, GpuWriter, threads)
-    return most, _printed(functions, GpuWriter, most)
+    few, many = _THREADS
+    with contextlib.suppress(TooLargeError):
+        return few, _printed(functions, GpuWriter, few)
+    return many, _printed(functions, GpuWriter, many)
 
 
 def _printed(
@@ -543,10 +542,9 @@ def called_names(program: bytes) -> list[str]:
 def load(name: str) -> bool:
     """Load a function from the cache and register it with XLA; return whether it is there."""
     with _locks[name]:
-        path = _cache_path(name)
-        if name in libraries or path is None:
-            return name in libraries
-        return bool(cache.read(path, "compiled", functools.partial(_register, name)))
+        if name not in libraries and (path := _cache_path(name)):
+            cache.read(path, "compiled", functools.partial(_register, name))
+        return name in libraries
 
 
 def _cache_path(name: str) -> Path | None:
@@ -555,7 +553,7 @@ def _cache_path(name: str) -> Path | None:
     return Path(folder) / "native" / name if folder else None
 
 
-def _register(name: str, body: bytes) -> bool:
+def _register(name: str, body: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.so"
         path.write_bytes(body)
@@ -563,7 +561,6 @@ def _register(name: str, body: bytes) -> bool:
     function = jax.ffi.pycapsule(getattr(library, name))
     jax.ffi.register_ffi_target(name, function, platform=_PLATFORMS[jax.default_backend()])
     libraries[name] = library
-    return True
 
 
 # --- linear maps ---------------------------------------------------------------------------------

@@ -292,8 +292,7 @@ class GpuWriter(SimdWriter):
     def elements(self, size: int, lines: Sequence[str]) -> list[str]:
         """Return a loop over the elements `i` of a thread; `s` counts its iterations."""
         turns, index = self._turns(size), "s * THREADS + thread"
-        divisible = size % self._threads == 0
-        head = f"  const int i = {index if divisible else f'min({index}, {size - 1})'};"
+        head = f"  const int i = {f'min({index}, {size - 1})' if self._guard(size) else index};"
         if turns == 1:
             return ["{", "  const int s = 0;", head, *lines, "}"]
         unroll = "#pragma unroll" if turns <= _UNROLLED else "#pragma unroll 1"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import importlib.util
@@ -26,10 +27,8 @@ def _library() -> ctypes.CDLL | None:
     folders = list(package.submodule_search_locations or ()) if package else []
     paths = [str(x) for path in folders for x in sorted(Path(path).glob("*/lib/libnvrtc.so.*"))]
     for path in (*paths, "libnvrtc.so.13", "libnvrtc.so.12"):
-        try:
+        with contextlib.suppress(OSError):
             return ctypes.CDLL(path)
-        except OSError:
-            continue
     return None
 
 
@@ -39,10 +38,9 @@ def target() -> str | None:
     device = jax.devices()[0]
     if (library := _library()) is None or not hasattr(device, "compute_capability"):
         return None
-    version = ctypes.c_int(), ctypes.c_int()
-    library.nvrtcVersion(*map(ctypes.byref, version))
-    major, minor = (x.value for x in version)
-    return f"{major}.{minor} sm_{device.compute_capability.replace('.', '')}"
+    major, minor = ctypes.c_int(), ctypes.c_int()
+    library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
+    return f"{major.value}.{minor.value} sm_{device.compute_capability.replace('.', '')}"
 
 
 def images(texts: Sequence[str]) -> list[bytes]:
@@ -51,10 +49,9 @@ def images(texts: Sequence[str]) -> list[bytes]:
     Raises:
       CompilerError: NVRTC fails.
     """
-    distinct = list(dict.fromkeys(texts))
-    with ThreadPoolExecutor(len(distinct)) as pool:
-        compiled = dict(zip(distinct, pool.map(_image, distinct), strict=True))
-    return [compiled[text] for text in texts]
+    with ThreadPoolExecutor() as pool:
+        compiled = {text: pool.submit(_image, text) for text in dict.fromkeys(texts)}
+    return [compiled[text].result() for text in texts]
 
 
 def _image(text: str) -> bytes:

@@ -39,9 +39,22 @@ _MAX_UNROLLED = 500  # equations of the body of a scan that is unrolled
 # empty: all operands.
 _MOVES = {
     **dict.fromkeys(
-        ("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "slice", "rev"), (0,)
+        (
+            "broadcast_in_dim",
+            "reshape",
+            "squeeze",
+            "expand_dims",
+            "slice",
+            "rev",
+            "transpose",
+            "split",
+            "unstack",
+            "tile",
+            "dynamic_slice",
+            "gather",
+        ),
+        (0,),
     ),
-    **dict.fromkeys(("transpose", "split", "unstack", "tile", "dynamic_slice", "gather"), (0,)),
     **dict.fromkeys(("pad", "dynamic_update_slice"), (0, 1)),
     **dict.fromkeys(("stack", "concatenate"), ()),
     "scatter": (0, 2),

@@ -36,6 +36,7 @@ _TYPES: dict[str, type] = dict.fromkeys(_FLAGS, np.int8)
 _LATER = {"repositions", "contact_lost_path"}  # outcomes that version 0.4.0 does not store
 StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk and its content
 _PREFETCH = 16384  # worlds of one program that are built before they are needed, about
+_FIRST = 64  # worlds of the first batch: programs are loaded while the others are built
 
 
 def name_of(chunk: int) -> str:
@@ -70,19 +71,22 @@ class PlanRequest:
         ahead = max(1, _PREFETCH // self.plan.part)
         by_key = chunks_by_key(self.plan, self.plan.chunks)
         for key, chunks in chunks_by_key(self.plan, self.chunks).items():
-            trials = sum(self.plan.chunks[chunk].size for chunk in by_key[key])
-            yield Job(key, trials, _prefetch(map(self._build, chunks), ahead))
+            num_trials = sum(self.plan.chunks[chunk].size for chunk in by_key[key])
+            parts = [self.plan.chunks[chunk] for chunk in chunks]
+            if setting.simulator.traced:
+                parts[:1] = filter(np.size, np.split(parts[0], [_FIRST]))
+            yield Job(key, num_trials, _prefetch(map(self._build, parts), ahead))
 
-    def _build(self, chunk: int) -> WorldBatch:
-        """Build the worlds of a chunk; those of the first law record the drawn quantities."""
-        law, worlds = np.divmod(self.plan.chunks[chunk], self.plan.worlds)
+    def _build(self, trials: np.ndarray) -> WorldBatch:
+        """Build the worlds of trials; those of the first law record the drawn quantities."""
+        law, worlds = np.divmod(trials, self.plan.worlds)
         drawn = draw(self.plan, worlds)
         if law[0] == 0:
             table = draws.table(drawn)
             self.results.put_drawn(worlds, {name: values for name, (values, _) in table.items()})
         batch = drawn_worlds(self.plan.domain, drawn, self.plan.setting)
         params = list(self.plan.laws.values())[law[0]]
-        return batch._replace(indices=self.plan.chunks[chunk]).with_params(params)
+        return batch._replace(indices=trials).with_params(params)
 
 
 class Results:

@@ -6,6 +6,7 @@ JAX nor MuJoCo. `flags` parses the options, and `running` checks them before any
 
 import atexit
 import contextlib
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ def run() -> NoReturn:
 
     To take it down takes half a second, and threads of XLA that still compile can crash meanwhile.
     """
+    gc.disable()  # until the command runs: imports leave no garbage that is worth a search
     codes = list[int]()
     atexit.register(_end, codes)  # the first that is registered runs last
     environment.start_process()

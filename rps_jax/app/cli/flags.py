@@ -212,7 +212,8 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     specs = []
     for field in _offered(info.type):
         default = vars(info.default)[field.name]  # as it was given: a property may convert it
-        marks: list[object] = [_NO_PREFIX] if types_[field.name] in (Setting, Rules) else []
+        is_group = types_[field.name] in (Setting, Rules)
+        marks: list[object] = [_NO_PREFIX] if is_group else []
         if field.metadata.get(options.POSITIONAL):
             marks = [tyro.conf.Positional, tyro.conf.arg(metavar=field.name.upper())]
             default = tyro.MISSING if default == "" else default
@@ -222,7 +223,8 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
         if get_origin(kind) is Sequence:
             kind = tuple[get_args(kind)[0], ...]
         marked = typing.cast(type, Annotated[(kind, *marks)] if marks else kind)
-        text = partial(_text_of, info.type, field.name, info.markers)
+        # The help has no text of a group, which tyro would read from the source at once.
+        text = "" if is_group else partial(_text_of, info.type, field.name, info.markers)
         if (spec := declared.get(field.name)) is not None and spec.about:
             text = _help_of(spec)
         specs.append(StructFieldSpec(field.name, marked, default, text))

@@ -4,7 +4,6 @@ A module of the package defines a command by `name = call_of(Class)`. So does th
 question, or `study.py` of a folder.
 """
 
-import ast
 import functools
 import importlib
 import itertools
@@ -45,13 +44,10 @@ def known() -> dict[str, Command]:
     for room in _HEADINGS:
         for path in sorted((_PACKAGE / room).glob("*.py")):
             text = path.read_text(encoding="utf-8")
-            if definitions := _DEFINITION.findall(text):
-                classes = (node for node in ast.parse(text).body if isinstance(node, ast.ClassDef))
-                docs = {node.name: ast.get_docstring(node) or "" for node in classes}
-                module = f"rps_jax.{room}.{path.stem}"
-                for name, class_name in definitions:
-                    summary = docs[class_name].partition("\n")[0]
-                    commands[name.replace("_", " ")] = Command(module, class_name, summary)
+            module = f"rps_jax.{room}.{path.stem}"
+            for name, class_name in _DEFINITION.findall(text):
+                summary = re.findall(rf'(?ms)^class {class_name}\b.*?"""(.*?)["\n]', text)[0]
+                commands[name.replace("_", " ")] = Command(module, class_name, summary)
     return commands
 
 

@@ -6,6 +6,7 @@ import _thread
 import contextlib
 import dataclasses
 import errno
+import gc
 import importlib
 import io
 import os
@@ -162,6 +163,9 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
         _raise_interrupts()
         importlib.import_module("scipy.special")  # JAX does, too: in two threads they could meet
         bar.on_compiled = _import_early
+        if not gc.isenabled():  # imported modules are never garbage
+            gc.freeze()
+            gc.enable()
         results = command.execute(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
         timed = timed and not getattr(command, "REPORTS_TIMES", False)

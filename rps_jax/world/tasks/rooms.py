@@ -38,7 +38,6 @@ from rps_jax.world.tasks.path import LOOKAHEAD, Following, PathCourse
 # Fields of a ROS map, and those that Nav2 ignores.
 _ROS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 _IGNORED = ("map_type", "frame_id")
-Graph = scipy.sparse.csr_array
 _UNKNOWN = 205  # grey of unknown cells, as maps are saved
 _OUTSIDE = "it lies in an obstacle or outside of the room (of an image, try a smaller tolerance)"
 _MAX_WALLS = 4096
@@ -369,7 +368,7 @@ def _plan(walls: Any, starts: Any, goals: Any, base_radius: float, radius: float
 
 def _sight_lines(
     nodes: np.ndarray, a: Entries, b: Entries, clearance: float
-) -> tuple[np.ndarray, Graph]:
+) -> tuple[np.ndarray, scipy.sparse.csr_array]:
     """Return nodes with those about the corners of walls, and the graph of their sight lines."""
     around = (np.unique([a, b])[:, None] + clearance * _TURN).ravel()
     is_clear = distances(around[:, None], around[:, None], a, b).min(axis=1) > clearance
@@ -381,7 +380,9 @@ def _sight_lines(
     return nodes, scipy.sparse.csgraph.csgraph_from_dense(lengths, np.inf)
 
 
-def _grid(nodes: np.ndarray, a: Entries, b: Entries, clearance: float) -> tuple[np.ndarray, Graph]:
+def _grid(
+    nodes: np.ndarray, a: Entries, b: Entries, clearance: float
+) -> tuple[np.ndarray, scipy.sparse.csr_array]:
     """Return nodes with the clear points of a grid, and the graph of their eight neighbours."""
     low, size = complex(a.real.min(), a.imag.min()), (np.ptp(a.real), np.ptp(a.imag))
     cell = max(clearance / 5, np.sqrt(np.prod(size) / _MAX_CELLS))
