@@ -75,6 +75,7 @@ from rps_jax.control.laws.unicycle import MODES, contact_of, turn_around
 from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry.arrays import Array, Parameter
+from rps_jax.robot.robot import Robot
 from rps_jax.spec import Bound, Spec, document
 
 PUSH, BACK, AROUND = 0, 1, 2  # modes
@@ -596,11 +597,19 @@ _DRIVE = PoseParams(
     beyond=0.05,
     looks=1.0,
 )
-# Names of the presets that are tuned for bases with a drive.
-PRESET_OF = {"omni": "pose", "differential": "pose_drive"}
 PRESETS = {
     "pose": PoseParams(),
     "pose_drive": _DRIVE,  # for bases that cannot move sideways
     # The same with a narrow front, as 0.3 m of `turtlebot4`.
     "pose_narrow": _DRIVE._replace(l_edge=0.13, l_turn=0.14, gap=0.15, beyond=0.03),
 }
+
+
+def preset_of(robot: Robot) -> str | None:
+    """Return the name of the preset for a base; None: none suits its drive or its front."""
+    if robot.radius is not None or robot.drive not in LAW.drives:
+        return None
+    if robot.drive == "omni":
+        return "pose"
+    # A contact that is off by l_edge must still be on the front.
+    return "pose_drive" if robot.half_width > _DRIVE.l_edge else "pose_narrow"
