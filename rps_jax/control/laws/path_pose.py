@@ -59,11 +59,11 @@ def step(
     touch = obs.touch._replace(base_radius=None, half_length=obs.front)
     yaw = jnp.asarray(touch.yaw_target)
     on_path = jnp.isnan(yaw)
-    path, *follows = unicycle.step(params.path, state.path, touch)
+    path, *on_way = unicycle.step(params.path, state.path, touch)
     near = obs._replace(touch=touch._replace(yaw_target=jnp.where(on_path, 0.0, yaw)))
-    ended, *poses = pose.step(params.pose, state.pose, near)
-    twist, details = soft.tree_where(on_path, follows, poses)
-    return PathPoseState(path, soft.tree_where(on_path, state.pose, ended)), twist, details
+    ended, *at_end = pose.step(params.pose, state.pose, near)
+    (twist, details), ended = soft.tree_where(on_path, (on_way, state.pose), (at_end, ended))
+    return PathPoseState(path, ended), twist, details
 
 
 def observe_sent(
