@@ -205,7 +205,6 @@ CASES = {
     "push --task pose,yaw_success=0": "task yaw_success = 0",
     "push --task pose --target 0.6 0.1": r"target = \(0.6, 0.1\) m is not allowed: the object st",
     "push --task pose,yaw=1": "unknown task quantity of pose 'yaw'",
-    "push --task path,d_success=0.1": "task d_success = 0.1 is not allowed: give a heading",
     "push --task path,heading=1 --law pose": "task = path with the law pose is not allowed: its ta",
     "push --task corridor,heading=1": "task = corridor with the law path_pose is not allowed: its",
     "push --task rooms,goal=4:2:1": r"task goal = \[4.0, 2.0, 1.0\] is not allowed: write pairs",

@@ -40,13 +40,6 @@ class PathPoseState(NamedTuple):
     pose: PoseState
 
 
-def check(params: PathPoseParams) -> PathPoseParams:
-    """Return the parameters if they are in range; otherwise raise InputError."""
-    unicycle.check(params.path)
-    pose.check(params.pose)
-    return params
-
-
 def init(params: PathPoseParams) -> PathPoseState:
     """Return the state before the first contact."""
     return PathPoseState(unicycle.init(params.path), pose.init(params.pose))
@@ -59,11 +52,12 @@ def step(
     touch = obs.touch._replace(base_radius=None, half_length=obs.front)
     yaw = jnp.asarray(touch.yaw_target)
     on_path = jnp.isnan(yaw)
-    path, *on_way = unicycle.step(params.path, state.path, touch)
+    path, way_twist, way_details = unicycle.step(params.path, state.path, touch)
     near = obs._replace(touch=touch._replace(yaw_target=jnp.where(on_path, 0.0, yaw)))
-    ended, *at_end = pose.step(params.pose, state.pose, near)
-    (twist, details), ended = soft.tree_where(on_path, (on_way, state.pose), (at_end, ended))
-    return PathPoseState(path, ended), twist, details
+    ended, twist, details = pose.step(params.pose, state.pose, near)
+    ended = soft.tree_where(on_path, state.pose, ended)
+    twist = soft.tree_where(on_path, way_twist, twist)
+    return PathPoseState(path, ended), twist, soft.tree_where(on_path, way_details, details)
 
 
 def observe_sent(
@@ -87,7 +81,6 @@ LAW = Law(
     init,
     step,
     senses="ends",
-    check=check,
     bounds=nested_bounds("pose", dict(bounds_of(PoseParams))),
     drives=pose.LAW.drives,
     room=pose.LAW.room,

@@ -146,8 +146,6 @@ def _pushed_face(
 
 
 _HEADING = Quantity("rad", "heading of the last push", ge=-_TURN, le=_TURN, owner="course")
-_PLACE = Spec("m", "greatest error of the place", gt=0, le=1)
-_YAW = Spec("rad", "greatest error of the heading", gt=0, le=3.2)
 
 
 @dataclass(frozen=True)
@@ -155,19 +153,12 @@ class Posed(Task):
     """Tasks whose goal may have a heading."""
 
     heading: Annotated[Range | None, _HEADING] = None
-    # Of a goal with a heading; None: those of the task `pose`.
-    d_success: Annotated[float | None, _PLACE] = None
-    yaw_success: Annotated[float | None, _YAW] = None
 
     def __post_init__(self) -> None:
         for angle in self.heading[:2] if self.heading else ():
             if abs(angle) > _TURN:
                 rule = "it is beyond 2 pi: give radians, as 1.571 for 90 degrees"
                 raise errors.not_allowed("task heading", f"{angle:g}", rule)
-        for name in ("d_success", "yaw_success"):
-            value = getattr(self, name)
-            if self.heading is None and value is not None:
-                raise errors.not_allowed(f"task {name}", value, "give a heading, or leave it out")
         super().__post_init__()
 
     @property
@@ -184,8 +175,9 @@ class Posed(Task):
         if self.heading is None:
             return None
         heading = self.heading.at(inputs.u["heading"]) + inputs.bearing
-        limits = self.d_success or Pose.d_success, self.yaw_success or Pose.yaw_success
-        leaves: Any = (ends, heading, *(0 * heading + x for x in limits))
+        task = self if isinstance(self, Pose) else Pose
+        limits = (0 * heading + x for x in (task.d_success, task.yaw_success))
+        leaves: Any = (ends, heading, *limits)
         return PoseCourse(*leaves)
 
 
@@ -204,12 +196,12 @@ class Pose(Posed):
     }
 
     heading: Annotated[Range, _HEADING] = Range(-math.pi, math.pi)
-    d_success: Annotated[float, _PLACE] = 0.05
-    yaw_success: Annotated[float, _YAW] = 0.1
     turn: Annotated[
         float | None,
         Spec("rad", "heading relative to the face that is first felt flush", ge=-_TURN, le=_TURN),
     ] = None
+    d_success: Annotated[float, Spec("m", "greatest error of the place", gt=0, le=1)] = 0.05
+    yaw_success: Annotated[float, Spec("rad", "greatest error of the heading", gt=0, le=3.2)] = 0.1
 
     def check(self) -> None:
         """Raise InputError for a heading beside a turn."""
