@@ -46,9 +46,8 @@ STALE: dict[str, str] = {
             "attack",
             "fit_methods",
             "fit_methods_quantities",
-            "rivals_tuned",
         ),
-        "tuners got worlds of their own, which no sweep meets",
+        "tuners got separate worlds, which no sweep meets",
     ),
     **dict.fromkeys(("ground",), "a push ran in the program of a sweep, with other last bits"),
     **dict.fromkeys(
@@ -79,10 +78,7 @@ STALE: dict[str, str] = {
         "exported code tests the bits of numbers for NaN",
     ),
     **dict.fromkeys(
-        (
-            "drives_learned",
-            "sb3",
-        ),
+        ("sb3",),
         "the value function of `rps learn` observes the room to walls",
     ),
     "fit_one_push": "a sum in the solver got its former order back, with other last bits",

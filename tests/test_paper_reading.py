@@ -14,7 +14,7 @@ from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from sweeps import render_tables
 from sweeps.paper_reading import drawing, evidence, experiments, printed
-from sweeps.paper_reading.printed import NUMBERS, Printed
+from sweeps.paper_reading.printed import PRINTED, Printed
 from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, Proposal, redraw_hardware, texts
 
 RNG = default_rng(0)
@@ -24,12 +24,12 @@ RNG = default_rng(0)
     ("number", "simulated", "trials", "likelihood"),
     [
         # With half a success in one trial both rates are Beta(1, 1): all counts are equally likely.
-        (Printed(5, of=8), 0.5, 1, 1 / 9),
+        (Printed(5, trials=8), 0.5, 1, 1 / 9),
         # Beta(3/2, 3/2): C(2, 1) B(5/2, 5/2) / B(3/2, 3/2) = 2 (3 pi / 128) / (pi / 8).
-        (Printed(1, of=2), 1, 2, 0.375),
-        (Printed(0, of=2), 1, 2, 0.3125),
-        (Printed(1, of=1), 1, 1, 0.9),
-        (Printed(1, of=1), 0, 1, 0.1),
+        (Printed(1, trials=2), 1, 2, 0.375),
+        (Printed(0, trials=2), 1, 2, 0.3125),
+        (Printed(1, trials=1), 1, 1, 0.9),
+        (Printed(1, trials=1), 0, 1, 0.1),
         (Printed(0.03, deviation=0.004), 0.034, 8, np.exp(-0.5) / (0.004 * np.sqrt(2 * np.pi))),
         (Printed(0.03, deviation=0.004), np.nan, 8, 0),
     ],
@@ -41,10 +41,10 @@ def test_the_likelihood_of_a_number_equals_one_by_hand(number, simulated, trials
 
 
 def test_the_papers_numbers_are_all_there():
-    parts = [printed.part_of(name) for name in NUMBERS]
+    parts = [printed.part_of(name) for name in PRINTED]
     assert [parts.count(part) for part in printed.PARTS] == [6, 18, 3, 5]
-    assert NUMBERS["Table II, RPS, nonuniform box S1"] == Printed(19, 24)
-    assert NUMBERS["hardware, box: D"].value == 0.032
+    assert PRINTED["Table II, RPS, nonuniform box S1"] == Printed(19, 24)
+    assert PRINTED["hardware, box: D"].value == 0.032
 
 
 def test_the_counts_of_table_ii_and_of_some_targets():
@@ -59,7 +59,7 @@ def test_the_counts_of_table_ii_and_of_some_targets():
     success[:, 1] = x > 0  # NPS reaches 10 targets ahead
     success[:, 0, 2, 0] = (x == 0) & (y == 1)
     counts = printed.counts(success)
-    assert set(counts) == {n for n in NUMBERS if not n.startswith(("hardware", "Fig. 6"))}
+    assert set(counts) == {n for n in PRINTED if not n.startswith(("hardware", "Fig. 6"))}
     sizes = {name: (int(count[0]), trials) for name, (count, trials) in counts.items()}
     assert sizes["Table II, NPS, cylinder S2"] == (10, 24)
     assert sizes["NPS, beside or behind"] == (0, 84)
@@ -161,23 +161,23 @@ def test_what_the_text_tells_of_fig_6_is_observed(changes, violated):
 
 def test_nothing_holds_of_a_trial_without_contact():
     holds = observed(dict.fromkeys(AS_TOLD, [0] * 7), 0)
-    assert set(holds) == {name for name in NUMBERS if name.startswith("Fig. 6")}
+    assert set(holds) == {name for name in PRINTED if name.startswith("Fig. 6")}
     assert not any(holds.values())
 
 
 @pytest.fixture(scope="module")
 def toy():
     """Three draws: the second has all of the paper's numbers, the others half of the counts."""
-    values = np.array([number.value for number in NUMBERS.values()])
+    values = np.array([number.value for number in PRINTED.values()])
     simulated = np.stack([0.5 * values, values, 0.5 * values])
-    trials = xr.DataArray([max(number.of, 1) for number in NUMBERS.values()], dims="number")
-    numbers = xr.DataArray(simulated, {"number": list(NUMBERS)}, ("draw", "number"))
+    trials = xr.DataArray([max(number.trials, 1) for number in PRINTED.values()], dims="number")
+    numbers = xr.DataArray(simulated, {"number": list(PRINTED)}, ("draw", "number"))
     return xr.Dataset(
         {
             "simulated": numbers,
             "trials": trials,
             "log_likelihood": printed.log_likelihoods(
-                numbers, trials.assign_coords(number=list(NUMBERS))
+                numbers, trials.assign_coords(number=list(PRINTED))
             ),
             "u": (("draw", "unknown"), Proposal.prior().sample(3, RNG)),
             "log_proposal": ("draw", np.zeros(3)),

@@ -92,9 +92,9 @@ class Maps(SpeedStudy[xr.Dataset]):
     def _measured(self, path: Path) -> xr.Dataset:
         """Return the numbers of a map."""
         scale, start, goal, cells = push_of(path)
-        ends = f"start={':'.join(map(str, start))},goal={':'.join(map(str, goal))}"
+        places = f"start={':'.join(map(str, start))},goal={':'.join(map(str, goal))}"
         begin = time.perf_counter()
-        task = parse_domain("wide", None, f"rooms,{path},{ends},scale={scale}:{scale}").task
+        task = parse_domain("wide", None, f"rooms,{path},{places},scale={scale}:{scale}").task
         load = time.perf_counter() - begin
         begin = time.perf_counter()
         replace(task, goal=((goal[0] + 1e-3, goal[1]),))  # plans again, with the walls it has
@@ -148,7 +148,9 @@ def push_of(path: Path) -> tuple[int, tuple[float, float, float], tuple[float, f
         lengths = scale * resolution * np.linalg.norm(same - start, axis=1)
         lengths[lengths > REACH] = 0
         if lengths.max(initial=0) > REACH / 3:
-            ends = [(start + 0.5)[::-1], (same[lengths.argmax()] + 0.5)[::-1]]
-            (x, y), (to_x, to_y) = (np.round(origin + resolution * end, 3).tolist() for end in ends)
+            route = [(start + 0.5)[::-1], (same[lengths.argmax()] + 0.5)[::-1]]
+            (x, y), (to_x, to_y) = (
+                np.round(origin + resolution * end, 3).tolist() for end in route
+            )
             return scale, (x, y, round(math.atan2(to_y - y, to_x - x), 3)), (to_x, to_y), free.size
     raise InputError(f"{path} has no room of {_ROOM} m around a way of {REACH / 3:.1f} m.")

@@ -215,7 +215,7 @@ def evolved(replay: Replay, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     costs = [least_squares.cost(values.derivatives(batch)[0]) for batch in batches]
     best = batches.reshape(-1, u.shape[1])[np.argmin(costs)]
     *_, best = itertools.islice(evolve(replay, best, np.min(costs), len(batches)), _GENERATIONS)
-    u = np.tile(best, (least_squares.STARTS, 1))  # as many as `minima` compiles for
+    u = np.tile(best, (least_squares.STARTS, 1))  # the number that `minima` compiles for
     r, j = replay.derivatives(u)
     return u[:1], r[:1], j[:1]
 

@@ -3,7 +3,7 @@
     rps sweeps/force_push_grid
 
 pushes the box and the cylinder of Heins and Schoellig (2024) along a straight path, by their law
-and in their open loop, from every start of their grid, which stands in `grid`.
+and in their open loop, from every start of their grid, which is in `grid`.
 """
 
 from __future__ import annotations

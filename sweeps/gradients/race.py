@@ -166,7 +166,7 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
 
     methods: tuple[str, ...] = (FIRST, "slopes", "evolution")
     """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials), or evolution."""
-    counts: tuple[int, ...] = (6, 64, 2048)
+    counts: tuple[int, ...] = tuple(COUNTS)
     """Numbers of tuned parameters: 6 and 13 of RPS, or 64, 512, 2048 and 4097 of laws with
     tables."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)

@@ -89,20 +89,20 @@ class Stiff(Study[xr.Dataset]):
 
             heights = 0.05 + _FALL + np.linspace(-0.01, 0.01, self.starts)
             both = jax.jit(jax.vmap(lambda x: jax.jvp(last, (x,), (jnp.ones_like(x),))))
-            ends, slopes = map(np.asarray, both(jnp.asarray(heights)))
-        line = np.polyfit(heights, ends, 1)[0]
+            heights_after, slopes = map(np.asarray, both(jnp.asarray(heights)))
+        line = np.polyfit(heights, heights_after, 1)[0]
         return xr.Dataset({"mean": slopes.mean(), "std": slopes.std(ddof=1), "slope": line})
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the derivatives at bounces."""
         names = {"mean": "mean", "std": "deviation", "slope": "slope"}
-        numbers = ({"name": name, "format": "{:.2g}"} for name in names.values())
+        formats = ({"name": name, "format": "{:.2g}"} for name in names.values())
         rows = [
             [*case.split(", "), *(float(results[x].sel(case=case)) for x in names)]
             for case in CASES
         ]
         words = ({"name": name, "merge": True} for name in ("steps", "contact"))
-        columns = [*words, {"name": "derivatives"}, *numbers]
+        columns = [*words, {"name": "derivatives"}, *formats]
         return [Table(rows, "", columns, name="gradients_stiff", title="Bounces")]
 
 

@@ -1,4 +1,4 @@
-"""How much do results depend on the pressure under objects?
+"""Dependence of results on the pressure under objects.
 
 rps sweeps/ground/support.py --machine "2 cores of an AMD EPYC"
 

@@ -7,7 +7,7 @@ import xarray as xr
 
 from rps_jax.analysis.figures.style import Figure, shade
 from sweeps.paper_reading import evidence
-from sweeps.paper_reading.printed import NUMBERS
+from sweeps.paper_reading.printed import PRINTED
 from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS
 
 _COLOURS = {"prior": "0.75", "posterior": "C0", "left out": "C1"}
@@ -42,9 +42,9 @@ def predictions(results: xr.Dataset) -> Figure:
     """Draw the paper's numbers beside their predictions: medians, 5 to 95 %."""
     predicted, at = evidence.predictions(results), evidence.closest(results)
     groups = {
-        "D [m]": [n for n, x in NUMBERS.items() if x.unit == "m"],
-        "time [s]": [n for n, x in NUMBERS.items() if x.unit == "s"],
-        "share of successes [%]": [n for n, x in NUMBERS.items() if x.of > 1],
+        "D [m]": [n for n, x in PRINTED.items() if x.unit == "m"],
+        "time [s]": [n for n, x in PRINTED.items() if x.unit == "s"],
+        "share of successes [%]": [n for n, x in PRINTED.items() if x.trials > 1],
     }
     figure = Figure(figsize=(11, 8), layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.6))
@@ -52,7 +52,7 @@ def predictions(results: xr.Dataset) -> Figure:
     for place, (title, names) in zip(places, groups.items(), strict=True):
         ax = figure.add_subplot(place)
         for row, name in enumerate(names):
-            scale = 100 / NUMBERS[name].of if NUMBERS[name].of else 1.0
+            scale = 100 / PRINTED[name].trials if PRINTED[name].trials else 1.0
             for shift, (key, (low, middle, high)) in enumerate(predicted[name].items()):
                 y, label = row + 0.2 * (shift - 1), _LABELS[key] if row == 0 else None
                 ax.plot([scale * low, scale * high], [y, y], color=_COLOURS[key], lw=3, label=label)
@@ -61,7 +61,7 @@ def predictions(results: xr.Dataset) -> Figure:
             ax.plot(
                 ours, row, "o", mfc="w", color="C3", ms=5, label=None if row else "the closest draw"
             )
-            ax.plot(scale * NUMBERS[name].value, row, "k*", ms=9, label=None if row else "paper")
+            ax.plot(scale * PRINTED[name].value, row, "k*", ms=9, label=None if row else "paper")
         ax.set_yticks(range(len(names)), [name.replace("hardware, ", "") for name in names])
         ax.tick_params(labelsize=8)
         ax.set_xlabel(title)

@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from rps_jax.analysis import statistics
 from sweeps.paper_reading import experiments, printed
-from sweeps.paper_reading.printed import NUMBERS, PARTS
+from sweeps.paper_reading.printed import PARTS, PRINTED
 from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, Part, Proposal, texts, values
 
 _READINGS = ("saturate_first", "clip_each")  # of which the evidence is compared
@@ -73,8 +73,8 @@ def proposal(results: xr.Dataset) -> Proposal:
         low, high = 0.0, 1.0
         for _ in range(30):
             middle = 0.5 * (low + high)
-            each = normalised(middle * fit - results.log_proposal.values)
-            enough = effective(_of_simulations(results, each)) >= least
+            tempered = normalised(middle * fit - results.log_proposal.values)
+            enough = effective(_of_simulations(results, tempered)) >= least
             low, high = (middle, high) if enough else (low, middle)
         weights[part] = normalised(low * fit - results.log_proposal.values)
     return Proposal.fitted(results.u.values, weights)
@@ -87,7 +87,7 @@ def summary(results: xr.Dataset) -> str:
     return (
         f"{weights.size:,} draws of the text and the simulation, each with "
         f"{results.sizes['draw'] // weights.size} draws of the hardware: {len(NAMES)} unknowns "
-        f"against {len(NUMBERS)} numbers and observations of the paper; effective number of draws "
+        f"against {len(PRINTED)} numbers and observations of the paper; effective number of draws "
         f"{effective(weights):.0f}. A mean has a normal likelihood, with a standard deviation of "
         f"{1000 * printed.D:g} mm for D and {printed.TIME:g} s for times; a count a beta-binomial "
         "one; an observation in the text is wrong with a probability of "
@@ -113,7 +113,7 @@ def readings_table(results: xr.Dataset) -> list[list[str]]:
     weights = [normalised(log_weights(results, parts=parts)) for parts in columns.values()]
     for words in itertools.product(*(UNKNOWNS[name].choices for name in _READINGS)):
         mask = np.all([x == word for x, word in zip(chosen, words, strict=True)], 0)
-        cells = [_probability(results, each, mask) for each in weights]
+        cells = [_probability(results, x, mask) for x in weights]
         rows.append([*words, *cells])
     return rows
 
@@ -164,19 +164,19 @@ def predictions(results: xr.Dataset) -> dict[str, dict[str, np.ndarray]]:
     """
     prior = normalised(-results.log_proposal.values)
     posterior = normalised(log_weights(results))
-    found = {}
+    predicted = {}
     for name in _names(results):
         simulated = scaled(results, name)
         left_out = normalised(log_weights(results, without=name))
-        each = {"prior": prior, "posterior": posterior, "left out": left_out}
-        found[name] = {key: quantiles(simulated, weights) for key, weights in each.items()}
-    return found
+        by_kind = {"prior": prior, "posterior": posterior, "left out": left_out}
+        predicted[name] = {key: quantiles(simulated, weights) for key, weights in by_kind.items()}
+    return predicted
 
 
 def scaled(results: xr.Dataset, name: str) -> np.ndarray:
     """Return a simulated number (draw,), a count as if out of the paper's number of trials."""
-    simulated, of = results.simulated.sel(number=name).values, NUMBERS[name].of
-    return simulated * of / float(results.trials.sel(number=name)) if of else simulated
+    simulated, trials = results.simulated.sel(number=name).values, PRINTED[name].trials
+    return simulated * trials / float(results.trials.sel(number=name)) if trials else simulated
 
 
 def numbers_table(results: xr.Dataset) -> list[list[str]]:
@@ -188,17 +188,17 @@ def numbers_table(results: xr.Dataset) -> list[list[str]]:
     header = ["number", "paper", "prior", "posterior", "predicted from the others"]
     rows = [[*header, "the closest draw", "inside the paper's interval"]]
     for name, quantities in predicted.items():
-        number, ours = NUMBERS[name], scaled(results, name)[at]
-        cells = [_words(name, each) for each in quantities.values()]
+        printed_number, ours = PRINTED[name], scaled(results, name)[at]
+        cells = [_words(name, x) for x in quantities.values()]
         inside = "yes" if agrees(name, ours) else "no"
-        rows.append([name, _word(name, number.value), *cells, _word(name, ours), inside])
+        rows.append([name, _word(name, printed_number.value), *cells, _word(name, ours), inside])
     weights = normalised(-results.log_proposal.values), normalised(log_weights(results))
     for words, names in (("cells of Table II", _cells(results)), ("all of these", _names(results))):
         matches = _matches(results, names)
-        ranges = [_range(quantiles(matches, each), ".0f") for each in weights]
-        of = f"{len(names)} of {len(names)}"
+        ranges = [_range(quantiles(matches, x), ".0f") for x in weights]
+        largest = f"{len(names)} of {len(names)}"
         ours = f"{matches[at]:.0f} of {len(names)}"
-        rows.append([f"inside the interval: {words}", of, *ranges, "", ours, ""])
+        rows.append([f"inside the interval: {words}", largest, *ranges, "", ours, ""])
     return rows
 
 
@@ -209,26 +209,26 @@ def _matches(results: xr.Dataset, names: list[str]) -> np.ndarray:
 
 def agrees(name: str, values: np.ndarray) -> np.ndarray:
     """Return whether numbers agree with the paper's: within its Wilson interval or tolerance."""
-    number = NUMBERS[name]
-    if number.of > 1:
-        low, high = statistics.wilson(int(number.value), number.of)
-        share = values / number.of
+    number = PRINTED[name]
+    if number.trials > 1:
+        low, high = statistics.wilson(int(number.value), number.trials)
+        share = values / number.trials
         return (low - _ROUNDING <= share) & (share <= high + _ROUNDING)
     return np.abs(values - number.value) <= 2 * number.deviation
 
 
 def _word(name: str, value: float) -> str:
-    number = NUMBERS[name]
-    if number.of == 1:
+    number = PRINTED[name]
+    if number.trials == 1:
         return "yes" if value else "no"
-    if number.of:
-        return f"{value:.0f} of {number.of}"
+    if number.trials:
+        return f"{value:.0f} of {number.trials}"
     return f"{value:.3f} m" if number.unit == "m" else f"{value:.0f} s"
 
 
 def _words(name: str, limits: np.ndarray) -> str:
     """Return a median and its interval."""
-    return _range(limits, ".3f" if NUMBERS[name].unit == "m" else ".0f")
+    return _range(limits, ".3f" if PRINTED[name].unit == "m" else ".0f")
 
 
 def _range(limits: np.ndarray, form: str) -> str:
@@ -241,9 +241,9 @@ def checks_table(results: xr.Dataset) -> list[list[str]]:
     rows = [["number", "paper", *(f"{engine}: mean, range" for engine in results.engine.values)]]
     for name in map(str, results.checked_number.values):
         repeated = results.checked.sel(checked_number=name).values
-        form = {"m": ".3f", "s": ".0f"}.get(NUMBERS[name].unit, ".1f")
+        form = {"m": ".3f", "s": ".0f"}.get(PRINTED[name].unit, ".1f")
         cells = [f"{x.mean():{form}} [{x.min():{form}}, {x.max():{form}}]" for x in repeated]
-        rows.append([name, _word(name, NUMBERS[name].value), *cells])
+        rows.append([name, _word(name, PRINTED[name].value), *cells])
     return rows
 
 

@@ -297,7 +297,7 @@ def numbers(
             name: (np.array([each[name] for each in observed]), 1) for name in observed[0]
         }
         results |= {name: (np.repeat(x, samples), count) for name, (x, count) in simulated.items()}
-    names = [name for name in printed.NUMBERS if name in results]
+    names = [name for name in printed.PRINTED if name in results]
     columns = {
         "simulated": (("draw", "number"), np.stack([results[n][0] for n in names], 1)),
         "trials": ("number", [results[name][1] for name in names]),

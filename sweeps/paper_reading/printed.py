@@ -19,7 +19,7 @@ class Printed(NamedTuple):
     """Number of the paper."""
 
     value: float
-    of: int = 0  # trials of a count; 1: an observation that the text tells; 0: a mean
+    trials: int = 0  # trials of a count; 1: an observation that the text tells; 0: a mean
     deviation: float = 0.0  # of a mean
     unit: str = ""
 
@@ -28,26 +28,26 @@ class Printed(NamedTuple):
 
         A count is beta-binomial: both counts have one unknown rate, with the prior of Jeffreys.
         """
-        if self.of == 1:
+        if self.trials == 1:
             return np.log(np.where(simulated == self.value, 1 - WRONG, WRONG))
-        if self.of:
+        if self.trials:
             rates = simulated + 0.5, trials - simulated + 0.5
-            return stats.betabinom.logpmf(self.value, self.of, *rates)
+            return stats.betabinom.logpmf(self.value, self.trials, *rates)
         off = stats.norm.logpdf(simulated, self.value, self.deviation)
         return np.where(np.isfinite(off), off, -np.inf)
 
 
-def _numbers() -> dict[str, Printed]:
-    numbers = {}
+def _printed() -> dict[str, Printed]:
+    by_name = {}
     for key, name in SHORT.items():
         printed = paper.HARDWARE_RESULTS[key]
-        numbers[f"hardware, {name}: successes"] = Printed(printed.success, 8)
-        numbers[f"hardware, {name}: D"] = Printed(printed.mean_abs_l, 0, D, "m")
-        numbers[f"hardware, {name}: time"] = Printed(printed.time, 0, TIME, "s")
+        by_name[f"hardware, {name}: successes"] = Printed(printed.success, 8)
+        by_name[f"hardware, {name}: D"] = Printed(printed.mean_abs_l, 0, D, "m")
+        by_name[f"hardware, {name}: time"] = Printed(printed.time, 0, TIME, "s")
     for (law, name, friction), count in paper.TABLE_II.items():
         words = name.replace("_", " ")
-        numbers[f"Table II, {law.upper()}, {words} {friction}"] = Printed(count, 24)
-    numbers |= {
+        by_name[f"Table II, {law.upper()}, {words} {friction}"] = Printed(count, 24)
+    by_name |= {
         "RPS, nonuniform box to (0, 1)": Printed(0, 2),
         "NPS, beside or behind": Printed(0, 84),
         "APS, not straight ahead": Printed(0, 132),
@@ -57,10 +57,10 @@ def _numbers() -> dict[str, Printed]:
         "Fig. 6: line contact before Realignment": Printed(1, 1),
         "Fig. 6: one Realignment State": Printed(1, 1),
     }
-    return numbers
+    return by_name
 
 
-NUMBERS = _numbers()
+PRINTED = _printed()
 PARTS = ("hardware", "Table II", "targets", "Fig. 6")
 
 
@@ -75,14 +75,14 @@ def counts(success: xr.DataArray) -> dict[str, tuple[np.ndarray, int]]:
     Args:
       success: (draw, law, object, friction, target), with target_x and target_y [m].
     """
-    found = {}
+    by_name = {}
     for law in success.law.values:
         of_law = success.sel(law=law)
         for name in success.object.values:
             for friction in success.friction.values:
                 words = f"Table II, {str(law).upper()}, {name.replace('_', ' ')} {friction}"
                 cell = of_law.sel(object=name, friction=friction)
-                found[words] = cell.sum("target").values, cell.sizes["target"]
+                by_name[words] = cell.sum("target").values, cell.sizes["target"]
     x, y = success.target_x, success.target_y
     side = (x == 0) & (y == 1)
     chosen = {
@@ -94,14 +94,14 @@ def counts(success: xr.DataArray) -> dict[str, tuple[np.ndarray, int]]:
     }
     for name, trials in chosen.items():
         dims = ("object", "friction", "target")
-        found[name] = trials.sum(dims).values, int(np.prod([trials.sizes[d] for d in dims]))
-    return found
+        by_name[name] = trials.sum(dims).values, int(np.prod([trials.sizes[d] for d in dims]))
+    return by_name
 
 
 def log_likelihoods(simulated: xr.DataArray, trials: xr.DataArray) -> xr.DataArray:
     """Return the log likelihood (draw, number) of simulated numbers, counts out of `trials`."""
     columns = [
-        NUMBERS[name].log_likelihood(
+        PRINTED[name].log_likelihood(
             simulated.sel(number=name).values, int(trials.sel(number=name))
         )
         for name in map(str, simulated.number.values)

@@ -1,4 +1,4 @@
-"""What sight adds to touch, and the share of worlds that a planner solves.
+"""Success with sight beside touch, and the share of worlds that a planner solves.
 
 rps sweeps/pose/sight.py --worlds 1000
 

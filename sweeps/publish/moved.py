@@ -60,14 +60,14 @@ class Moved(Study[xr.Dataset]):
         for path in published():
             old = dict(_estimates(json.loads(earlier.get(path.stem, '{"rows": []}'))))
             for key, text in _estimates(json.loads(path.read_text())):
-                if before := old.get(key):
+                if former := old.get(key):
                     compared += 1
-                    if _apart(before, text):
+                    if _is_disjoint(former, text):
                         name = f"{path.stem} {key[0]}"
                         why = next(why for x, why in WHY.items() if fnmatch.fnmatch(name, x))
-                        moved.append((path.stem, *key[:2], before, text, why))
+                        moved.append((path.stem, *key[:2], former, text, why))
         columns = zip(*moved, strict=True) if moved else ((),) * len(_NAMES)
-        cells = {name: ("cell", list(of)) for name, of in zip(_NAMES, columns, strict=True)}
+        cells = {name: ("cell", list(column)) for name, column in zip(_NAMES, columns, strict=True)}
         return xr.Dataset({**cells, "compared": compared})
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
@@ -117,11 +117,11 @@ def _estimates(data: Mapping[str, Any]) -> Iterator[tuple[tuple[str, str, int], 
                 yield (row_name, name, labels[row_name]), cell
 
 
-def _apart(one: str, other: str) -> bool:
+def _is_disjoint(former: str, text: str) -> bool:
     """Return whether the intervals of two numbers have no common value."""
     (_, low, high), (_, other_low, other_high) = (
         map(float, match.groups())
-        for match in (_INTERVAL.match(one), _INTERVAL.match(other))
+        for match in (_INTERVAL.match(former), _INTERVAL.match(text))
         if match
     )
     return high < other_low or other_high < low

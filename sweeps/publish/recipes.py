@@ -40,12 +40,12 @@ def recipe(
     return Recipe(commands, cores, gpu, **table)
 
 
-def _each(command: str, *names: str) -> tuple[str, ...]:
+def _filled(command: str, *names: str) -> tuple[str, ...]:
     return tuple(command.format(name) for name in names)
 
 
 _WIDE = ("wide", "hostile")
-_LADDERS = _each("rps ladder --domain {0} --worlds 10000 --seed 10 --out runs/ladder_{0}", *_WIDE)
+_LADDERS = _filled("rps ladder --domain {0} --worlds 10000 --seed 10 --out runs/ladder_{0}", *_WIDE)
 _AGAINST = ("", "success", "against rps_tuned", "p (Holm)")
 _OBJECTS = ("random_box", "random_cylinder", "random_prism")
 _RATES = ("", *_OBJECTS, "all", "median time", "timeout", "lost contact", "fell over")
@@ -86,7 +86,7 @@ _IN_WIDE = "sweep --domain wide --worlds 1000 --seed 9243"
 _PRESETS = ("turtlebot4", "jackal", "husky", "mir100", "pioneer_3dx")
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
 _FORMER = "sweeps/learned/learned_0_4.npz"  # `learned` of 0.4
-_LEARNED = _each(
+_LEARNED = _filled(
     "rps sweep --domain {0} --worlds 10000 --seed 5301 "
     "--laws rps_plus sweeps/learned/learned_gru.npz learned --out runs/learned_{0}",
     *_WIDE,
@@ -136,7 +136,7 @@ RECIPES: dict[str, Recipe] = {
         section="Table II*",
     ),
     "hardware": recipe(
-        *_each("rps hardware --engine fused{}", *_HARDWARE.values()),
+        *_filled("rps hardware --engine fused{}", *_HARDWARE.values()),
         cores=2,
         section="Hardware experiments",
         labels=tuple(_HARDWARE),
@@ -149,7 +149,7 @@ RECIPES: dict[str, Recipe] = {
     "bearings": recipe(*_LADDERS[:1], gpu=3, section=rows.by_bearing),
     "ceiling": recipe(
         *_LADDERS,
-        *_each("rps ceiling runs/ladder_{} --samples 32 --rounds 6", *_WIDE),
+        *_filled("rps ceiling runs/ladder_{} --samples 32 --rounds 6", *_WIDE),
         gpu=20,
         section="A planner that knows the world",
         labels=("", "", *_WIDE),
@@ -180,7 +180,7 @@ RECIPES: dict[str, Recipe] = {
         columns=_RATES,
     ),
     "robots": recipe(
-        *_each(
+        *_filled(
             "rps sweep --domain wide --worlds 4096 --seed 11 --laws rps rps_tuned --robot {}",
             *_ROBOTS,
         ),
@@ -226,10 +226,10 @@ RECIPES: dict[str, Recipe] = {
     "attack": recipe(
         "rps attack --law rps_tuned --domain wide --minutes 3.5 --batch 64 --repeats 3 "
         "--drawn 600 --check-again 8",
-        "rps attack --law rps_plus --domain wide --minutes 13 --batch 128 --repeats 2 "
+        "rps attack --law rps_plus --domain wide --minutes 6 --batch 128 --repeats 2 "
         "--drawn 256 --check-again 24",
         "rps attack --law rps_plus --domain wide --axes height size friction_ground "
-        "--minutes 5 --batch 96 --repeats 2 --drawn 64 --check-again 12",
+        "--minutes 4 --batch 96 --repeats 2 --drawn 64 --check-again 12",
         cores=30,
         section=rows.attack_table,
         labels=("rps_tuned", "rps_plus", "rps_plus, three axes"),
@@ -288,7 +288,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "force_push_grid": recipe("rps sweeps/force_push_grid", cores=4, section="Pushes that succeed"),
     "rivals_tuned": recipe(
-        *_each(
+        *_filled(
             "rps tune es --law {0} --domain wide hostile --worlds 16 --population 12 "
             "--generations 200 --budget 400000 --validation 64 --out runs/tuned_{0}",
             *_RIVALS,
@@ -337,7 +337,9 @@ RECIPES: dict[str, Recipe] = {
         columns=_RATES,
     ),
     "presets": recipe(
-        *_each(f"rps {_IN_WIDE} --robot {{0}} --laws unicycle --out runs/preset_{{0}}", *_PRESETS),
+        *_filled(
+            f"rps {_IN_WIDE} --robot {{0}} --laws unicycle --out runs/preset_{{0}}", *_PRESETS
+        ),
         f"rps {_IN_WIDE} --robot f1tenth --laws unicycle_car --out runs/preset_f1tenth",
         f"rps {_IN_WIDE} --robot f1tenth --laws unicycle_car --max-lost 600 --out runs/preset_600",
         gpu=2,
@@ -351,7 +353,7 @@ RECIPES: dict[str, Recipe] = {
         gpu=3,
     ),
     "floors_*": recipe(f"rps sweeps/floors {_MACHINE}", cores=30, gpu=2),
-    "tasks_parity": recipe(f"rps sweeps/corridors/parity.py {_MACHINE}", cores=90),
+    "tasks_parity": recipe(f"rps sweeps/corridors/parity.py --part 300 {_MACHINE}", cores=90),
     "tasks_cost_cpu": recipe(f"rps sweeps/corridors/costs.py {_MACHINE}", cores=3),
     "tasks_cost_gpu": recipe(
         f"rps sweeps/corridors/costs.py --worlds 16384 --rounds 6 {_MACHINE}", gpu=2
@@ -372,7 +374,7 @@ RECIPES: dict[str, Recipe] = {
     "gradients_direction": recipe(f"rps sweeps/gradients/direction.py {_MACHINE}", cores=5),
     "gradients_race": recipe(f"rps sweeps/gradients/race.py {_MACHINE}", cores=60),
     "gradients_tables": recipe(
-        *_each(f"{_TABLES}:{{0}} --domain hostile {_HOSTILE} --out runs/{{0}}", *_PLUS_TABLES),
+        *_filled(f"{_TABLES}:{{0}} --domain hostile {_HOSTILE} --out runs/{{0}}", *_PLUS_TABLES),
         "rps ladder --domain wide hostile --worlds 10000 --seed 69 --laws rps_plus "
         + " ".join(f"sweeps/gradients/tables.py:{x},runs/{x}/tuned.json" for x in _PLUS_TABLES),
         cores=60,
@@ -487,7 +489,7 @@ RECIPES: dict[str, Recipe] = {
     "moved": recipe(f"rps sweeps/publish/moved.py {_MACHINE}", cores=1),
 }
 
-# Files of old versions, which are not computed again.
+# Files of old versions; they are not computed again.
 HISTORY = {
     "tuning_runs": "the runs of 0.1.0 and 0.2.0 that tuned the law",
     "learned": "the runs of 0.2.0 that trained the laws",
