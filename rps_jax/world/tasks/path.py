@@ -96,8 +96,8 @@ class PathCourse(NamedTuple):
         length = self.line.arcs[-1]
         is_near = moved.share * length > length - APPROACH
         # The last pushes to the pose are no errors of the path.
-        kept = progress._replace(arc=moved.arc, share=moved.share)
-        moved = jax.tree.map(partial(jnp.where, is_near), kept, moved)
+        passed = progress._replace(arc=moved.arc, share=moved.share)
+        moved = jax.tree.map(partial(jnp.where, is_near), passed, moved)
         target = jnp.where(is_near, end.p_world_target, aim.p_world_target)
         yaw = jnp.where(is_near, self.goal.heading, jnp.nan)
         success = is_near & jnp.asarray(end.success)
@@ -219,8 +219,8 @@ class Path(Following):
         """Return the ends and the paths of worlds."""
         vertices = self.vertices(inputs)
         lookahead: Entries = self.lookahead.at(inputs.u["lookahead"])
-        ends, line = vertices[:, -1], Polyline.through(vertices)
-        return ends, PathCourse(line, lookahead, self.goals(inputs, ends))
+        targets, line = vertices[:, -1], Polyline.through(vertices)
+        return targets, PathCourse(line, lookahead, self.goals(inputs, targets))
 
     def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
         """Raise InputError for waypoints that start away from the base's front."""

@@ -170,14 +170,14 @@ class Posed(Task):
         """Names of the numbers that are not drawn."""
         return frozenset(() if self.heading else ("heading",))
 
-    def goals(self, inputs: CourseInputs, ends: np.ndarray) -> PoseCourse | None:
-        """Return the goals at the ends (n, 2) [m] of worlds; None without a heading."""
+    def goals(self, inputs: CourseInputs, targets: np.ndarray) -> PoseCourse | None:
+        """Return the goals at the targets (n, 2) [m] of worlds; None without a heading."""
         if self.heading is None:
             return None
         heading = self.heading.at(inputs.u["heading"]) + inputs.bearing
         task = self if isinstance(self, Pose) else Pose
         limits = (0 * heading + x for x in (task.d_success, task.yaw_success))
-        leaves: Any = (ends, heading, *limits)
+        leaves: Any = (targets, heading, *limits)
         return PoseCourse(*leaves)
 
 

@@ -125,7 +125,7 @@ class Rooms(Following):
         return super().idle | (set() if len(self._routes) > 1 else {"route"})
 
     @property
-    def _ends(self) -> tuple[np.ndarray, np.ndarray]:
+    def _last_lines(self) -> tuple[np.ndarray, np.ndarray]:
         """Both ends (G,) [m] in the map of the last straight lines of paths; equal by default."""
         goals = np.array(self.goal) @ (1, 1j)
         last = APPROACH / self.scale.low * np.exp(1j * self.heading.low) if self.heading else 0.0
@@ -134,13 +134,13 @@ class Rooms(Following):
     @property
     def _routes(self) -> np.ndarray:
         """Vertices (R, N) [m] of the paths from each start to each goal in the map."""
-        first, goals = self._ends
+        first, goals = self._last_lines
         points = tuple(zip(first.real.tolist(), first.imag.tolist(), strict=True))
         map_ = *(tuple(map(tuple, x)) for x in (self.walls, self.start)), points
         radii = self.base_radius / self.scale.low, self.object_radius / self.scale.low
         routes = _plan(*map_, *radii)
-        ends = np.tile(goals, len(self.start))[:, None]
-        return np.append(routes, ends, axis=1) if self.heading else routes
+        last = np.tile(goals, len(self.start))[:, None]
+        return np.append(routes, last, axis=1) if self.heading else routes
 
     @property
     def _near(self) -> tuple[np.ndarray, np.ndarray | None]:
@@ -174,7 +174,7 @@ class Rooms(Following):
                 rule = "give one heading in the map, so that a path can be planned"
                 raise errors.not_allowed("task heading", self.heading, rule)
             clearance = (self.base_radius + self.object_radius) / self.scale.low
-            first, goals = self._ends
+            first, goals = self._last_lines
             pairs = (np.array(self.walls) @ (1, 1j)).reshape(-1, 2).T
             away = distances(first[:, None], goals[:, None], *pairs).min()
             if away < clearance:
@@ -217,11 +217,11 @@ class Rooms(Following):
         vertices[:, :2, 0] = np.maximum(vertices[:, :2, 0], inputs.front[:, None])
         near, reach = self._near
         walls: Entries = _placed(near[route], starts, scale).reshape(route.size, -1, 2, 2)
-        ends, goals = vertices[:, -1], self.goals(inputs, vertices[:, -1])
+        targets, goals = vertices[:, -1], self.goals(inputs, vertices[:, -1])
         goals = goals and goals._replace(heading=goals.heading - starts[:, 2])
         path = PathCourse(Polyline.through(vertices), lookahead, goals)
         course = CorridorCourse(path, walls, reach=None if reach is None else reach[route] * scale)
-        return ends, course
+        return targets, course
 
 
 def _placed(points: np.ndarray, starts: np.ndarray, scale: Number) -> np.ndarray:
