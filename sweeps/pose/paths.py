@@ -32,11 +32,14 @@ _ROOM: dict[str, Any] = {
     "heading": pi / 2,
     "base_radius": 1.3,
 }
-_TASKS = {"paths": f"path,heading={-pi}:{pi}", "rooms": _ROOM}
+_WORLDS = {
+    "paths, boxes": ("box", f"path,heading={-pi}:{pi}"),
+    "paths, prisms": ("prism", f"path,heading={-pi}:{pi}"),
+    "rooms, boxes": ("box", _ROOM),
+}
 CASES: dict[str, Case] = {
-    f"{worlds}, {shape} | {base} | 0.2 m/s": Case(f"wide,objects=random_{kind}", robot, law, task)
-    for worlds, task in _TASKS.items()
-    for shape, kind in (("boxes", "box"), ("prisms", "prism"))
+    f"{worlds} | {base} | 0.2 m/s": Case(f"wide,objects=random_{kind}", robot, law, task)
+    for worlds, (kind, task) in _WORLDS.items()
     for base, (robot, law) in _BASES.items()
 }
 
