@@ -254,7 +254,7 @@ def plan_of(
     worlds: int,
     setting: Setting,
     robot: str | None = None,
-    task: str | None = None,
+    task: str | Mapping[str, Any] | None = None,
 ) -> Plan:
     """Return the plan of a law in worlds of a domain, with a robot and a task."""
     ranges = parse_domain(domain, robot, task)

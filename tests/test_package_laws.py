@@ -50,8 +50,9 @@ def test_no_law_of_the_package_warns_that_it_is_slow(law, robot, task, skin, mon
     setting = Setting()
     kind, has_walls = registry.law_of(registry.LAWS[law]), task in ("corridor", "rooms")
     options = {"law": law, "robot": robot, "task": TASKS[task], "skin": skin}
-    if ROBOTS[robot].drive not in kind.drives or (kind.room and has_walls):
-        with refusing(r"it moves sideways|its detours need"):
+    follows = kind.follows or not kind.heading or task == "reach"
+    if ROBOTS[robot].drive not in kind.drives or (kind.room and has_walls) or not follows:
+        with refusing(r"it moves sideways|its detours need|the law does not follow"):
             pushes.build([Case("cylinder", **options)], setting)
         return
     case = Case("cylinder", **options)

@@ -2,7 +2,7 @@
 
 import math
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import jitted, refusing, rps
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
 from rps_jax import Details, Law, Twist
@@ -21,6 +21,7 @@ from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.quasistatic import Quasistatic, Slider
 from rps_jax.geometry import footprint as fp
 from rps_jax.robot import skin as skins
+from rps_jax.robot.robot import ROBOTS, Robot
 from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials import pushes
@@ -28,10 +29,13 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.live import Live
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.world import draws
+from rps_jax.world.domain import parse_domain
 from rps_jax.world.physics import Physics
 from rps_jax.world.tasks import parse_task
-from rps_jax.world.tasks.base import Positions
-from rps_jax.world.tasks.pose import PoseCourse
+from rps_jax.world.tasks.base import CourseInputs, Positions
+from rps_jax.world.tasks.path import APPROACH, PathCourse
+from rps_jax.world.tasks.pose import Pose, PoseCourse
 from sweeps.pose.sight import SightParams, sight_table
 from sweeps.pose.study import OUTCOMES, pose_table
 
@@ -201,10 +205,12 @@ CASES = {
     "push --task pose,yaw_success=0": "task yaw_success = 0",
     "push --task pose --target 0.6 0.1": r"target = \(0.6, 0.1\) m is not allowed: the object st",
     "push --task pose,yaw=1": "unknown task quantity of pose 'yaw'",
-    "push --task path,heading=1": "unknown task quantity of path 'heading'",
+    "push --task path,heading=1 --law pose": "task = path with the law pose is not allowed: its ta",
+    "push --task corridor,heading=1": "task = corridor with the law path_pose is not allowed: its",
     "push --task rooms,goal=4:2:1": r"task goal = \[4.0, 2.0, 1.0\] is not allowed: write pairs",
     "push --law pose,v_free=0": "v_free = 0",
     "push --law pose --robot f1tenth": "law = pose is not allowed",
+    "push --task pose --robot round": "no law for a round base brings objects to a heading; name",
 }
 
 
@@ -484,17 +490,6 @@ def test_the_law_asks_for_the_heading_where_the_goal_has_none():
     assert registry.law_of(registry.LAWS["pose"]).heading
 
 
-@pytest.mark.parametrize(
-    ("robot", "law"), [("ideal", "pose"), ("turtlebot4", "pose_drive"), ("f1tenth", None)]
-)
-def test_a_push_to_a_goal_with_a_heading_chooses_the_law_by_the_drive(robot, law):
-    if law is None:
-        with pytest.raises(rps_jax.InputError, match="brings objects to a heading; name one"):
-            _ = Case(robot=robot, task="pose")
-    else:
-        assert Case(robot=robot, task="pose").named_law == law
-
-
 def test_a_heading_relative_to_a_face_has_no_arrow_in_the_world_and_no_environment():
     setting = Setting("fused")
     live = Live(pushes.build([Case(task="pose,turn=1.5")], setting), setting)
@@ -504,3 +499,109 @@ def test_a_heading_relative_to_a_face_has_no_arrow_in_the_world_and_no_environme
     assert float(live._worlds.task.heading[0]) == pytest.approx(1.5)
     with refusing("environments know only headings in the world"):
         rps_jax.PushEnv(task="pose,turn=1.5", worlds=2)
+
+
+# --- at the end of a path ------------------------------------------------------------------
+
+
+@pytest.fixture
+def ending():
+    """Course of a path 4 m long ahead, which ends in a heading of 1 rad."""
+    zero = np.zeros(1)
+    inputs = CourseInputs({"heading": zero, "lookahead": zero}, np.zeros((1, 2)), zero)
+    task = parse_task("path,waypoints=0:0:4:0,heading=1")
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), task.courses(inputs)[1])
+
+
+def along(course, progress, x, **changes):
+    """Return progress and aim after a touch of a box x [m] along the path."""
+    box, end = fp.rectangle(0.3, 0.3), jnp.array([4.0, 0.0])
+    at = positions(box, np.array([x, 0.0]) + 0.3 * unit(1.0), 1.0, np.array([x, 0.0]), **changes)
+    at = at._replace(p_world_goal=end, base=jnp.array([0.0, 0.0, 1.0]))
+    return jitted(PathCourse.step)(course, progress, at)
+
+
+def test_a_path_ends_in_a_pose_from_its_last_part_on(ending):
+    """The law gets the end once it is near, and keeps it where a detour takes the object back."""
+    progress, aim = along(ending, ending.start(), 1.0)
+    assert np.isnan(aim.yaw_target)
+    assert_allclose(aim.p_world_target, [2.6, 0.0], atol=1e-5)
+    error = float(progress.max_error)
+    progress, aim = along(ending, progress, 2.0)
+    for x in (3.0, 2.1, 3.0, 4.03):
+        progress, aim = along(ending, progress, x)
+        assert float(aim.yaw_target) == pytest.approx(1.0)
+        assert_allclose(aim.p_world_target, [4.0, 0.0], atol=1e-6)
+        assert bool(aim.success) == (x > 4)
+    outcomes = progress.outcomes()
+    assert float(outcomes["place_error"]) == pytest.approx(0.03, abs=2e-6)
+    assert float(outcomes["error_max"]) == pytest.approx(error, abs=1e-6)
+    assert float(outcomes["progress"]) == pytest.approx(1)
+
+
+def test_a_path_without_a_heading_has_neither_its_number_nor_its_outcomes():
+    plain, posed = (parse_task(f"path,length=5{x}") for x in ("", ",heading=0.2"))
+    assert "heading" in plain.idle - posed.idle
+    assert set(posed.outcomes) - set(plain.outcomes) == set(Pose.OUTCOMES)
+    assert plain.shape != posed.shape
+
+
+def test_the_law_of_paths_delivers_boxes_to_the_pose_at_the_end():
+    free = "pose.v_free=0.2,pose.omega_free=0.5"
+    setting = Setting(rules=Rules(horizon=500.0), split="tune")
+    inputs = {"worlds": 8, "task": "path,heading=-3.14:3.14", "setting": setting}
+    results = rps_jax.sweep(f"path_pose,{free}", "wide,objects=random_box", **inputs)
+    assert int(results.success.sum()) >= 7
+    assert (results.declared > 0).all()
+    assert (results.error_95 < 1).all()
+    assert "heading" in results
+
+
+def test_before_the_end_of_the_path_its_law_runs_alone():
+    """Bit for bit `unicycle`, and then `pose` from its start."""
+    params = registry.LAWS["path_pose"]
+    law = registry.law_of(params)
+    touch = Observation(jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, 0.1]), ~NO, GOAL)
+    signals = jnp.zeros(42), jnp.ones(42, bool)
+    rest = jnp.zeros(2), jnp.zeros(2, bool), NO, jnp.asarray(0.3625)
+    obs = EndsObservation(touch._replace(yaw_target=jnp.asarray(jnp.nan)), *signals, *rest)
+    state, twist, _ = jax.jit(law.step)(params, law.init(params), obs)
+    alone = registry.law_of(params.path)
+    expected = jax.jit(alone.step)(params.path, alone.init(params.path), touch)[1]
+    assert_array_equal(jnp.stack(twist), jnp.stack(expected))
+    assert float(state.pose.time) == 0
+    obs = obs._replace(touch=touch._replace(yaw_target=jnp.zeros(())))
+    state, twist, _ = jax.jit(law.step)(params, state, obs)
+    pose = registry.law_of(params.pose)
+    expected = jax.jit(pose.step)(params.pose, pose.init(params.pose), obs)[1]
+    assert_allclose(jnp.stack(twist), jnp.stack(expected), atol=1e-8)
+
+
+def test_rooms_end_in_a_straight_line_along_the_heading_of_the_map():
+    """The heading is one of the map, which the start turns."""
+    hall = {"outline": [[0, 0], [9, 0], [9, 9], [0, 9]], "start": [2, 2, 0.5], "goal": [6, 6]}
+    task = parse_task(hall | {"heading": 1.2, "base_radius": 1.2})
+    drawn = draws.draw(parse_domain("wide", task=task), 0, np.arange(1))
+    last = np.diff(drawn.course.lines()["path"][0], axis=0)[-1]
+    assert_allclose(last, APPROACH * unit(0.7), atol=1e-6)
+    assert float(drawn.course.path.goal.heading[0]) == pytest.approx(0.7)
+    assert task.free_room == pytest.approx(1.45)
+    with refusing("task heading = -1.57 is not allowed: the last 1.6 m to a goal"):
+        parse_task(hall | {"heading": -1.57, "base_radius": 1.2})
+    with refusing("give one heading in the map"):
+        parse_task(hall | {"heading": [0, 1]})
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_every_robot_gets_a_law_for_poses_that_suits_its_drive_and_its_front(robot):
+    """A contact as far off as the law allows is still on the front; or the sentence says why."""
+    base = Robot.parse(robot)
+    for task in ("pose", "path,heading=1"):
+        if base.drive == "car" or base.radius is not None:
+            with refusing("brings objects to a heading; name one by law"):
+                _ = Case(robot=robot, task=task)
+            continue
+        name = Case(robot=robot, task=task).named_law
+        params: Any = registry.LAWS[str(name)]
+        assert base.drive in registry.law_of(params).drives
+        assert getattr(params, "pose", params).l_edge < base.half_width

@@ -42,7 +42,7 @@ class Export(Command[Path]):
         """Traced law and skin."""
         law = self.law
         if law is None:
-            law = registry.default_law(parse_robot(self.robot).drive, "rps_plus")
+            law = registry.default_law(parse_robot(self.robot), "rps_plus")
         return programs.program(law, self.robot, self.skin)
 
     @property

@@ -162,8 +162,9 @@ class Law(Generic[Params, State, Obs]):
     drives: tuple[DriveKind, ...] = ("omni",)  # whose bases can follow its twists
     room: float = 0.0  # [m] without walls around the object, for its detours
     # Whether it observes the heading of the goal. Of a goal without a heading, this is the
-    # direction from the base's start to the target.
+    # direction from the base's start to the target, or NaN for a law that follows paths.
     heading: bool = False
+    follows: bool = False  # whether a law with a heading follows paths, while this is NaN
     # state -> bool: whether the law declares that it is done, which ends the trial.
     is_done: Callable[[State], jax.Array] | None = None
     memory: Callable[[State], Memory] | None = None  # state -> Memory of one trial

@@ -39,7 +39,7 @@ from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import parse_changes
-from rps_jax.robot.robot import DriveKind
+from rps_jax.robot.robot import DriveKind, Robot
 from rps_jax.spec import Named
 
 T = TypeVar("T")  # a pytree
@@ -116,17 +116,23 @@ def law_of(params: LawParams | type) -> Law:
     return _LAWS_BY_CLASS[kind]
 
 
-def default_law(drive: DriveKind, law: str = "rps", heading: bool = False) -> str:
-    """Return the name of a law, or of one for bases with this drive or goals with a `heading`.
+def default_law(
+    robot: Robot, law: str = "rps", heading: bool = False, follows: bool = False
+) -> str:
+    """Return the name of a law for omnidirectional bases, or of one that suits the robot.
+
+    With a `heading`, it is a law for such goals, which also `follows` a path.
 
     Raises:
-      InputError: no law of the package brings objects to a heading with this drive.
+      InputError: no law of the package brings objects to a heading with this base.
     """
-    if heading and drive not in pose.PRESET_OF:
-        rule = f"no law for drive = {drive} brings objects to a heading; name one by law"
+    if not heading:
+        return ({"omni": law} | unicycle.PRESET_OF)[robot.drive]
+    if (name := pose.preset_of(robot)) is None:
+        base = f"drive = {robot.drive}" if robot.radius is None else "a round base"
+        rule = f"no law for {base} brings objects to a heading; name one by law"
         raise errors.not_allowed("law", "None", rule)
-    presets = pose.PRESET_OF if heading else {"omni": law} | unicycle.PRESET_OF
-    return presets[drive]
+    return f"path_{name}" if follows else name
 
 
 def laws_for(drive: DriveKind) -> list[str]:
@@ -135,11 +141,17 @@ def laws_for(drive: DriveKind) -> list[str]:
     return [name for name, law in laws.items() if drive in law.drives and not law.heading]
 
 
-def check_room(params: LawParams, task: str, room: float) -> None:
-    """Raise InputError unless a task leaves the law `room` [m] around the object."""
-    if (needed := law_of(params).room) > room:
-        name = f"{task} with the law {_name_of(params)}"
-        rule = f"its detours need {needed:g} m without walls around the object, not {room:g} m"
+def check_task(params: LawParams, task: str, room: float, follows: bool) -> None:
+    """Raise InputError unless a law suits a task.
+
+    This leaves it `room` [m] around the object, and its target moves if the law `follows` it.
+    """
+    law, name = law_of(params), f"{task} with the law {_name_of(params)}"
+    if follows and law.heading and not law.follows:
+        rule = "its target moves along a path, which the law does not follow; choose path_pose"
+        raise errors.not_allowed("task", name, f"{rule}, and heading=... for the path's end")
+    if law.room > room:
+        rule = f"its detours need {law.room:g} m without walls around the object, not {room:g} m"
         raise errors.not_allowed("task", name, f"{rule}; choose a wider one, or another law")
 
 

@@ -97,7 +97,7 @@ class Trace(Trajectory):
             parts = ["never touched"]
         elif "progress" in outcome.task:
             parts.append(f"{100 * float(outcome.task['progress']):.0f} % of the path passed")
-        elif "place_error" in outcome.task:
+        if "place_error" in outcome.task:
             place, turn = (float(outcome.task[f"{x}_error"]) for x in ("place", "heading"))
             parts.append(f"face off by {place:.3f} m and {turn:.3f} rad")
         parts += tasks.failures_of(outcome.task)

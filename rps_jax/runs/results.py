@@ -100,7 +100,7 @@ class Results:
         self.plan, self._store = plan, store
         self.shape = (len(plan.laws), plan.worlds)
         self._outcomes: Arrays = {}  # (law, world, ...)
-        for name in (*specs_of(Outcome), *plan.domain.task.OUTCOMES):
+        for name in (*specs_of(Outcome), *plan.domain.task.outcomes):
             axes = (3,) if name.endswith("_pose") else ()
             self._outcomes[name] = np.zeros((*self.shape, *axes), _TYPES.get(name, np.float32))
         self._drawn: Arrays = {}  # (world,) drawn quantities

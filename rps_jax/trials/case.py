@@ -63,7 +63,7 @@ class Case(TrialOptions):
     law: LawLike | None = None
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
     policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json. By default rps, unicycle on a
-    base that cannot move sideways, and pose for a goal with a heading."""
+    base that cannot move sideways, and pose or path_pose for a goal with a heading."""
     task: TaskLike = option("reach", kw_only=True)
     """The task: its name, or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
     Changes follow, as corridor,width=1.2. Ranges are drawn by the seed."""
@@ -77,7 +77,8 @@ class Case(TrialOptions):
         name = objects.parse_object(self.object)
         objects.check_object("object", name)
         registry.check_params(self.params)
-        registry.check_room(self.params, self.challenge.kind, self.challenge.free_room)
+        task, follows = self.challenge, not self.challenge.HAS_TARGET
+        registry.check_task(self.params, task.kind, task.free_room, follows)
         scene.check_contact(self.contact, self.mass)
         skins.parse_skin(self.skin or "ideal")
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
@@ -101,7 +102,8 @@ class Case(TrialOptions):
         if self.law is not None:
             return self.law
         has_heading = heading_of(self.challenge) is not None
-        return registry.default_law(self.base.drive, heading=has_heading)
+        follows = not self.challenge.HAS_TARGET
+        return registry.default_law(self.base, heading=has_heading, follows=follows)
 
     @cached_property
     def params(self) -> LawParams:

@@ -91,9 +91,9 @@ class PushEnv:
     each the filtered relative change of its capacitance [1], 0 if it is dead; then the target
     (x, y) [m] in the robot's frame, at the pose that the odometry estimates. Of a path, it is the
     point of the path a lookahead ahead of the contact. A goal with a heading adds its cosine and
-    sine in the robot's frame. With senses="ends", the last T + 5 numbers are the offsets [m] of the
-    left and the right end of the contact, whether each was seen, whether the contact is even, and
-    whether each taxel works.
+    sine in the robot's frame, which are 0 before the end of a path. With senses="ends", the last
+    T + 5 numbers are the offsets [m] of the left and the right end of the contact, whether each was
+    seen, whether the contact is even, and whether each taxel works.
 
     Action (3,): the twist (v_x, v_y, omega) in the robot's frame, in units of the parameters'
     v_max, v_max and omega_max. (v_x, v_y) is scaled down to a norm of 1, omega is clipped to +-1.
@@ -363,7 +363,7 @@ def _obs(obs: TaxelObservation | EndsObservation) -> jax.Array:
     goal = planar.rotate(-touch.yaw, touch.p_world_target - touch.p_world_robot)
     parts = [obs.signal, goal]
     if touch.yaw_target is not None:
-        parts.append(planar.unit(jnp.asarray(touch.yaw_target) - touch.yaw))
+        parts.append(jnp.nan_to_num(planar.unit(jnp.asarray(touch.yaw_target) - touch.yaw)))
     if isinstance(obs, EndsObservation):
         parts += [obs.ends, obs.seen, obs.even[None], obs.alive]
     return jnp.concatenate([x.astype(goal.dtype) for x in parts])

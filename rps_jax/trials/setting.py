@@ -134,7 +134,8 @@ class Setting:
         self.simulator.check_pads(domain.has_pads, self.physics)
         self.check_here(domain.weakest, laws)
         for params in laws:
-            registry.check_room(params, domain.task.kind, domain.task.free_room)
+            task, follows = domain.task, not domain.task.HAS_TARGET
+            registry.check_task(params, task.kind, task.free_room, follows)
 
     def to_json(self) -> JsonObject:
         """Return the setting as manifests have it; `from_json` reads it."""

@@ -377,7 +377,8 @@ def perceive(
     judged, measured = observe(world, params, trial, loop)
     obs: Pytree = measured.observation
     if law.heading and obs.yaw_target is None:
-        obs = obs._replace(yaw_target=planar.direction(obs.p_world_target))
+        yaw = planar.direction(obs.p_world_target)
+        obs = obs._replace(yaw_target=jnp.full_like(yaw, jnp.nan) if law.follows else yaw)
     if not law.smooth:
         obs = obs._replace(in_contact=measured.reading.contact_type != NONE)
     if law.senses == "pose":

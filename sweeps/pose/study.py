@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -29,11 +29,12 @@ _POOL = (f"wide, boxes | {_FAST}", f"wide, prisms | {_FAST}")
 
 
 class Case(NamedTuple):
-    """Worlds, base and law of a row."""
+    """Worlds, base, law and task of a row."""
 
     domain: str
     robot: str | None
     law: str
+    task: str | Mapping[str, Any] = f"pose,d_success={LOOSE},yaw_success={YAW}"
 
 
 CASES: dict[str, Case] = {
@@ -77,21 +78,24 @@ class Poses(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Goals with a heading"
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32}
-    CHOICES: ClassVar = {"cases": CASES}
+    ROWS: ClassVar[Mapping[str, Case]] = CASES
+    CHOICES: ClassVar = {"cases": ROWS}
+    GROWS: ClassVar = ("file",)
 
     cases: Sequence[str] = tuple(CASES)
     """Names of rows."""
     worlds: int = option(10000, 2, 10_000_000)
     """Number of worlds of each row."""
+    file: str = "pose"
+    """Name of the data file."""
     setting: Setting = field(default=Setting("fused", seed=530417), kw_only=True)
 
     @cached_property
     def plans(self) -> dict[str, Plan]:
         """The sweep of each row."""
-        task = f"pose,d_success={LOOSE},yaw_success={YAW}"
-        cases = {name: CASES[name] for name in self.cases}
+        cases = {name: self.ROWS[name] for name in self.cases}
         return {
-            name: plan_of(x.law, x.domain, self.worlds, self.setting, x.robot, task)
+            name: plan_of(x.law, x.domain, self.worlds, self.setting, x.robot, x.task)
             for name, x in cases.items()
         }
 
@@ -104,17 +108,16 @@ class Poses(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
     def intro(self, results: xr.Dataset) -> str:
         """Describe the worlds."""
         return (
-            f"{self.worlds:,} worlds of each row, seed {self.setting.seed}; headings all around "
-            f"the circle; true face within {YAW} rad, judged when the law declares to be done. "
-            "Intervals: Wilson 95 %."
+            f"{self.worlds:,} worlds of each row, seed {self.setting.seed}; true face within {YAW} "
+            "rad, judged when the law declares to be done. Intervals: Wilson 95 %."
         )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return success, times and errors of each row, and its failures by mechanism."""
         lost = float(self.setting.rules.max_lost)
         return [
-            Table(pose_table(results), name="pose", merge="worlds", title="Poses"),
-            Table(failure_table(results, lost), name="pose_failures", merge="worlds"),
+            Table(pose_table(results), name=self.file, merge="worlds", title="Poses"),
+            Table(failure_table(results, lost), name=f"{self.file}_failures", merge="worlds"),
         ]
 
 

@@ -75,6 +75,7 @@ from rps_jax.control.laws.unicycle import MODES, contact_of, turn_around
 from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry.arrays import Array, Parameter
+from rps_jax.robot.robot import Robot
 from rps_jax.spec import Bound, Spec, document
 
 PUSH, BACK, AROUND = 0, 1, 2  # modes
@@ -580,27 +581,39 @@ LAW = Law(
     observe_sent=observe_sent,
     memory=memory,
 )
-_DRIVE = PoseParams(
-    r=0.22,
-    s_min=0.8,
-    s_flush=0.6,
-    s_back=0.15,
-    y_tol=0.02,
-    cap=0.12,
-    K_h=2.0,
-    h_max=0.25,
-    l_edge=0.25,
-    back=0.3,
-    R=0.7,
-    gap=0.3,
-    beyond=0.05,
+_DRIVE = PoseParams(  # tuned in `wide` with boxes and a differential base
+    r=0.2459,
+    s_min=0.9729,
+    s_flush=0.6344,
+    s_back=0.1811,
+    y_tol=0.02185,
+    cap=0.08421,
+    y_miss=0.02424,
+    K_h=1.7,
+    h_max=0.3127,
+    omega_push=0.01651,
+    l_edge=0.2626,
+    l_turn=0.252,
+    back=0.2116,
+    R=0.6854,
+    gap=0.3875,
+    beyond=0.05025,
     looks=1.0,
+    tau=0.5982,
 )
-# Names of the presets that are tuned for bases with a drive.
-PRESET_OF = {"omni": "pose", "differential": "pose_drive"}
 PRESETS = {
     "pose": PoseParams(),
     "pose_drive": _DRIVE,  # for bases that cannot move sideways
     # The same with a narrow front, as 0.3 m of `turtlebot4`.
     "pose_narrow": _DRIVE._replace(l_edge=0.13, l_turn=0.14, gap=0.15, beyond=0.03),
 }
+
+
+def preset_of(robot: Robot) -> str | None:
+    """Return the name of the preset for a base; None: none suits its drive or its front."""
+    if robot.radius is not None or robot.drive not in LAW.drives:
+        return None
+    if robot.drive == "omni":
+        return "pose"
+    # A contact that is off by l_edge must still be on the front.
+    return "pose_drive" if robot.half_width > _DRIVE.l_edge else "pose_narrow"

@@ -122,6 +122,8 @@ def parse_task(task: TaskLike) -> Task:
         if name == "kind" or name not in known:
             continue
         default: Any = known[name].default
+        if value is default:
+            continue
         inner = get_args(field_types(kind)[name])
         size = len(get_args(inner[0])) if inner else 0
         try:

@@ -76,9 +76,10 @@ class Course(Protocol):
 def heading_of(course: Course | Task) -> Entries:
     """Return the heading of a course's goal [rad], or a task's range of it; None without one.
 
-    It is the field `heading` of either.
+    It is the field `heading` of either, or of the goal of a course along a path.
     """
-    return getattr(course, "heading", None)
+    course = getattr(course, "path", course)
+    return getattr(getattr(course, "goal", None) or course, "heading", None)
 
 
 def is_relative(course: Course) -> bool:
@@ -123,6 +124,11 @@ class Task:
                 items = np.ravel(value[:2] if isinstance(value, Range) else value).tolist()
                 changes.append(f"{item.name}={':'.join(map(str, items))}")
         return ",".join([self.kind, *changes])
+
+    @property
+    def outcomes(self) -> Mapping[str, Spec]:
+        """Outcomes that its trials have, by name."""
+        return self.OUTCOMES
 
     @property
     def has_contact_walls(self) -> bool:

@@ -2,14 +2,19 @@
 
 The law's target is the point of the path a lookahead ahead of the nearest point (pure pursuit), and
 laws do not change. A trial succeeds at the path's end.
+
+With a heading, the path ends in a pose, as in the task `pose`. From the last `APPROACH` on, the law
+observes the end and its heading. Before, the heading is NaN.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
@@ -22,12 +27,14 @@ from rps_jax.record.files import Arrays
 from rps_jax.robot.shell import Shell
 from rps_jax.spec import Spec
 from rps_jax.world.quantity import Quantity, Range, check_unused
-from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
+from rps_jax.world.tasks.base import Aim, CourseInputs, Positions
+from rps_jax.world.tasks.pose import PoseCourse, Posed, PoseProgress
 
 LOOKAHEAD = Quantity("m", "lookahead on the path", ge=0.05, le=5, owner="course")
 _SEGMENTS = 8  # of a drawn path
 _PER_SPAN = 6  # segments of a spline between two waypoints
 _REACH = 1.0  # [m] along the path, either way, in which the nearest point is sought
+APPROACH = 1.6  # [m] before the end, from which on the law gets the heading there
 _END = 0.5  # [m] before the end, from which on a trial may succeed
 _LEAD = 1.5  # [m] of a drawn path before its first turn, at least
 _MIN_SPACING = "consecutive waypoints must be at least 1 cm apart"
@@ -44,6 +51,7 @@ class PathProgress(NamedTuple):
     sum_error: Floats  # [m] over steps in contact
     max_error: Floats  # [m]
     counts: Int[Array, "*B 16"]  # steps in contact by the class of their error
+    pose: PoseProgress | None = None  # of a path that ends in a pose
 
     def outcomes(self) -> dict[str, Array]:
         """Return progress and cross-track errors; of a trial without contact they are NaN."""
@@ -62,6 +70,7 @@ class PathProgress(NamedTuple):
             "error_mean": self.sum_error / jnp.maximum(steps, 1) + nan,
             "error_95": quantile + nan,
             "error_max": self.max_error + nan,
+            **(self.pose.outcomes() if self.pose else {}),
         }
 
 
@@ -70,15 +79,29 @@ class PathCourse(NamedTuple):
 
     line: Polyline
     lookahead: Floats  # [m]
+    goal: PoseCourse | None = None  # pose at its end
 
     def start(self) -> PathProgress:
         """Return the progress at the start of the path."""
         zero = jnp.zeros_like(self.lookahead)
-        return PathProgress(zero, zero, zero, zero, jnp.zeros(len(_EDGES), jnp.int32))
+        counts, pose = jnp.zeros(len(_EDGES), jnp.int32), self.goal and self.goal.start()
+        return PathProgress(zero, zero, zero, zero, counts, pose)
 
     def step(self, progress: PathProgress, positions: Positions) -> tuple[PathProgress, Aim]:
-        """Follow the path."""
-        return self.follow(progress, positions.p_world_contact, positions.touches)
+        """Follow the path, and judge the pose at its end."""
+        moved, aim = self.follow(progress, positions.p_world_contact, positions.touches)
+        if self.goal is None or progress.pose is None:
+            return moved, aim
+        pose, end = self.goal.step(progress.pose, positions)
+        length = self.line.arcs[-1]
+        is_near = moved.share * length > length - APPROACH
+        # The last pushes to the pose are no errors of the path.
+        passed = progress._replace(arc=moved.arc, share=moved.share)
+        moved = jax.tree.map(partial(jnp.where, is_near), passed, moved)
+        target = jnp.where(is_near, end.p_world_target, aim.p_world_target)
+        yaw = jnp.where(is_near, self.goal.heading, jnp.nan)
+        success = is_near & jnp.asarray(end.success)
+        return moved._replace(pose=pose), Aim(target, yaw_target=yaw, success=success)
 
     def follow(
         self, progress: PathProgress, p_world_contact: Array, touches: Array
@@ -98,6 +121,7 @@ class PathCourse(NamedTuple):
             progress.sum_error + error,
             jnp.maximum(progress.max_error, error),
             progress.counts + counted,
+            progress.pose,
         )
         target = polyline.at_arc(self.line, arc + self.lookahead)
         return moved, Aim(target, at_end=arc > length - _END)
@@ -109,12 +133,12 @@ class PathCourse(NamedTuple):
         return self.line.arcs[-1] - arc + away
 
     def lines(self) -> Arrays:
-        """Return the path."""
-        return {"path": np.asarray(self.line.vertices)}
+        """Return the path, and the arrow at its end."""
+        return {"path": np.asarray(self.line.vertices), **(self.goal.lines() if self.goal else {})}
 
 
 @dataclass(frozen=True)
-class Following(Task):
+class Following(Posed):
     """Tasks that follow a path; their courses are a `PathCourse`, or have it as `path`."""
 
     OUTCOMES: ClassVar[Mapping[str, Spec]] = {
@@ -162,12 +186,12 @@ class Path(Following):
     def idle(self) -> frozenset[str]:
         """Names of the quantities that are not drawn; each turn draws its angle."""
         unused = ("length", "turns", *self.NUMBERS) if self.waypoints else ()
-        return frozenset(("turn_angle", *unused))
+        return super().idle | {"turn_angle", *unused}
 
     @property
     def shape(self) -> Hashable:
-        """Kind, and number of the vertices."""
-        return self.kind, len(self.waypoints), self.spline
+        """Kind, number of the vertices, and whether there is a heading."""
+        return self.kind, len(self.waypoints), self.spline, self.heading is None
 
     def check(self) -> None:
         """Raise InputError for waypoints that are no path."""
@@ -195,7 +219,8 @@ class Path(Following):
         """Return the ends and the paths of worlds."""
         vertices = self.vertices(inputs)
         lookahead: Entries = self.lookahead.at(inputs.u["lookahead"])
-        return vertices[:, -1], PathCourse(Polyline.through(vertices), lookahead)
+        targets, line = vertices[:, -1], Polyline.through(vertices)
+        return targets, PathCourse(line, lookahead, self.goals(inputs, targets))
 
     def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
         """Raise InputError for waypoints that start away from the base's front."""

@@ -11,12 +11,14 @@ of the base at that moment plus the turn. A cylinder counts as flush at its firs
 
 A law that declares that it is done (`Law.is_done`) is judged then and only then, so that the
 simulation does not stop it at a lucky moment. Another law is judged in each control step.
+
+A task that extends `Posed` has a goal with a heading, if the user gives one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -143,8 +145,44 @@ def _pushed_face(
     return faces[jnp.argmin(away)]
 
 
+_HEADING = Quantity("rad", "heading of the last push", ge=-_TURN, le=_TURN, owner="course")
+
+
 @dataclass(frozen=True)
-class Pose(Task):
+class Posed(Task):
+    """Tasks whose goal may have a heading."""
+
+    heading: Annotated[Range | None, _HEADING] = None
+
+    def __post_init__(self) -> None:
+        for angle in self.heading[:2] if self.heading else ():
+            if abs(angle) > _TURN:
+                rule = "it is beyond 2 pi: give radians, as 1.571 for 90 degrees"
+                raise errors.not_allowed("task heading", f"{angle:g}", rule)
+        super().__post_init__()
+
+    @property
+    def outcomes(self) -> Mapping[str, Spec]:
+        return {**self.OUTCOMES, **(Pose.OUTCOMES if self.heading else {})}
+
+    @property
+    def idle(self) -> frozenset[str]:
+        """Names of the numbers that are not drawn."""
+        return frozenset(() if self.heading else ("heading",))
+
+    def goals(self, inputs: CourseInputs, targets: np.ndarray) -> PoseCourse | None:
+        """Return the goals at the targets (n, 2) [m] of worlds; None without a heading."""
+        if self.heading is None:
+            return None
+        heading = self.heading.at(inputs.u["heading"]) + inputs.bearing
+        task = self if isinstance(self, Pose) else Pose
+        limits = (0 * heading + x for x in (task.d_success, task.yaw_success))
+        leaves: Any = (targets, heading, *limits)
+        return PoseCourse(*leaves)
+
+
+@dataclass(frozen=True)
+class Pose(Posed):
     """Push a face of the object to a place with a heading."""
 
     kind: str = "pose"
@@ -157,23 +195,13 @@ class Pose(Task):
         "declared": Spec("1", "whether the law declared that it was done"),
     }
 
-    heading: Annotated[
-        Range,
-        Quantity("rad", "heading of the last push", ge=-_TURN, le=_TURN, owner="course"),
-    ] = Range(-math.pi, math.pi)
+    heading: Annotated[Range, _HEADING] = Range(-math.pi, math.pi)
     turn: Annotated[
         float | None,
         Spec("rad", "heading relative to the face that is first felt flush", ge=-_TURN, le=_TURN),
     ] = None
     d_success: Annotated[float, Spec("m", "greatest error of the place", gt=0, le=1)] = 0.05
     yaw_success: Annotated[float, Spec("rad", "greatest error of the heading", gt=0, le=3.2)] = 0.1
-
-    def __post_init__(self) -> None:
-        for angle in self.heading[:2]:
-            if abs(angle) > _TURN:
-                rule = "it is beyond 2 pi: give radians, as 1.571 for 90 degrees"
-                raise errors.not_allowed("task heading", f"{angle:g}", rule)
-        super().__post_init__()
 
     def check(self) -> None:
         """Raise InputError for a heading beside a turn."""
@@ -201,12 +229,11 @@ class Pose(Task):
 
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, PoseCourse]:
         """Return the goals."""
-        heading = self.heading.at(inputs.u["heading"]) + inputs.bearing
-        constants = self.d_success, self.yaw_success
+        goals: Any = self.goals(inputs, inputs.p_world_target)
         if self.turn is not None:
-            heading, constants = np.full_like(heading, self.turn), (*constants, 1.0)
-        leaves: Any = (inputs.p_world_target, heading, *(0 * heading + x for x in constants))
-        return inputs.p_world_target, PoseCourse(*leaves)
+            turn = np.full_like(goals.heading, self.turn)
+            goals = goals._replace(heading=turn, relative=np.ones_like(turn))
+        return inputs.p_world_target, goals
 
 
 TASK = Pose

@@ -3,7 +3,8 @@
 The map has metres and a frame of its own. The world is the frame of the base at its start: it is at
 the origin and looks along x. The path is the shortest of a visibility graph around the corners of
 the walls, by Dijkstra's algorithm of `scipy.sparse.csgraph`; in a map of more than 128 walls, that
-of a grid, straightened. Points are complex numbers here.
+of a grid, straightened. With a heading, it ends in a straight line along this. Points are complex
+numbers here.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Quantity, Range
 from rps_jax.world.tasks.base import CourseInputs
 from rps_jax.world.tasks.corridor import Corridor, CorridorCourse
-from rps_jax.world.tasks.path import LOOKAHEAD, Following, PathCourse
+from rps_jax.world.tasks.path import APPROACH, LOOKAHEAD, Following, PathCourse
 
 # Fields of a ROS map, and those that Nav2 ignores.
 _ROS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
@@ -110,19 +111,35 @@ class Rooms(Following):
     @property
     def shape(self) -> Hashable:
         """Kind, numbers of routes and vertices, and of ends of walls: one more in large maps."""
-        return self.kind, self._routes.shape, min(len(self.walls), 2 * _NEAR + 1)
+        return (
+            self.kind,
+            self._routes.shape,
+            min(len(self.walls), 2 * _NEAR + 1),
+            self.heading is None,
+        )
 
     @property
     def idle(self) -> frozenset[str]:
         """Names of the numbers that are not drawn."""
-        return frozenset(() if len(self._routes) > 1 else ("route",))
+        return super().idle | (set() if len(self._routes) > 1 else {"route"})
+
+    @property
+    def _last_lines(self) -> tuple[np.ndarray, np.ndarray]:
+        """Both ends (G,) [m] in the map of the last straight lines of paths; equal by default."""
+        goals = np.array(self.goal) @ (1, 1j)
+        last = APPROACH / self.scale.low * np.exp(1j * self.heading.low) if self.heading else 0.0
+        return goals - last, goals
 
     @property
     def _routes(self) -> np.ndarray:
         """Vertices (R, N) [m] of the paths from each start to each goal in the map."""
-        map_ = (tuple(map(tuple, x)) for x in (self.walls, self.start, self.goal))
+        first, goals = self._last_lines
+        points = tuple(zip(first.real.tolist(), first.imag.tolist(), strict=True))
+        map_ = *(tuple(map(tuple, x)) for x in (self.walls, self.start)), points
         radii = self.base_radius / self.scale.low, self.object_radius / self.scale.low
-        return _plan(*map_, *radii)
+        routes = _plan(*map_, *radii)
+        last = np.tile(goals, len(self.start))[:, None]
+        return np.append(routes, last, axis=1) if self.heading else routes
 
     @property
     def _near(self) -> tuple[np.ndarray, np.ndarray | None]:
@@ -151,6 +168,20 @@ class Rooms(Following):
         ):
             if is_bad:
                 raise errors.not_allowed(f"task {name}", value, rule)
+        if self.heading:
+            if self.heading.low != self.heading.high:
+                rule = "give one heading in the map, so that a path can be planned"
+                raise errors.not_allowed("task heading", self.heading, rule)
+            clearance = (self.base_radius + self.object_radius) / self.scale.low
+            first, goals = self._last_lines
+            pairs = (np.array(self.walls) @ (1, 1j)).reshape(-1, 2).T
+            away = distances(first[:, None], goals[:, None], *pairs).min()
+            if away < clearance:
+                rule = (
+                    f"the last {APPROACH:g} m to a goal are a straight line along it, which keeps "
+                )
+                rule += f"{clearance:.2f} m from walls, and one is {away:.2f} m away"
+                raise errors.not_allowed("task heading", f"{self.heading.low:g}", rule)
         for _, _, yaw in self.start:
             errors.check_finite("yaw of task start", yaw, **_TURN_BOUNDS)
         _, reach = self._near
@@ -162,7 +193,7 @@ class Rooms(Following):
 
     @property
     def free_room(self) -> float:
-        return 0.0  # the map does not promise any
+        return self.base_radius + self.object_radius
 
     def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
         """Raise InputError for a path that is narrower than the base, or a wall at its start."""
@@ -185,9 +216,11 @@ class Rooms(Following):
         vertices[:, :2, 0] = np.maximum(vertices[:, :2, 0], inputs.front[:, None])
         near, reach = self._near
         walls: Entries = _placed(near[route], starts, scale).reshape(route.size, -1, 2, 2)
-        path = PathCourse(Polyline.through(vertices), lookahead)
+        targets, goals = vertices[:, -1], self.goals(inputs, vertices[:, -1])
+        goals = goals and goals._replace(heading=goals.heading - starts[:, 2])
+        path = PathCourse(Polyline.through(vertices), lookahead, goals)
         course = CorridorCourse(path, walls, reach=None if reach is None else reach[route] * scale)
-        return vertices[:, -1], course
+        return targets, course
 
 
 def _placed(points: np.ndarray, starts: np.ndarray, scale: Number) -> np.ndarray:
