@@ -204,6 +204,17 @@ def without_contacts(path, steps, monkeypatch, until=math.inf):
     return written
 
 
+def test_a_goal_gets_its_heading_at_the_end_of_a_path(tmp_path):
+    """A law of poses alone begins there."""
+    yaws = [math.nan] * 4 + [0.3] * 5
+    series = steps(9, signal=np.zeros(42))
+    series = [step._replace(yaw_target=yaw) for step, yaw in zip(series, yaws, strict=True)]
+    path = bag.write(tmp_path / "path.mcap", series, {})
+    assert_allclose(bag.read(path)["yaw_target"], yaws)
+    assert_allclose(Shadow(path, "path_pose").steps["yaw_target"], yaws)
+    assert_allclose(Shadow(path, "pose").steps["yaw_target"], yaws[4:])
+
+
 def test_the_skin_feels_the_taxels_of_a_bag_without_contacts(tmp_path, capsys, monkeypatch):
     """The skin filters a taxel at 0.4: (1 - exp(-t / 50 ms)) 0.4 > 0.25 from the third step."""
     signal = np.zeros(42)

@@ -65,7 +65,11 @@ class Shadow(BagQuestion[xr.Dataset]):
         law = registry.law_of(self.params)
         shapes = validation.observation_shapes(law.senses)
         names = [*named_leaves(shapes), *(("yaw_target",) if law.heading else ())]
-        return bags.read(Path(self.file), self.topics, names)
+        steps = bags.read(Path(self.file), self.topics, names)
+        if "yaw_target" in steps and not law.follows:
+            known = np.isfinite(steps["yaw_target"])
+            steps = {name: column[known] for name, column in steps.items()}
+        return steps
 
     def check(self) -> None:
         """Check the law, the robot and the bag."""

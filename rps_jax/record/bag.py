@@ -82,7 +82,7 @@ class Step(NamedTuple):
     object_pose: Floats | None = None  # (3,) [m, m, rad] for viewers alone
     path: np.ndarray | None = None  # (K, 2) [m] of the task, in the world
     walls: np.ndarray | None = None  # (W, 2, 2) [m] for viewers alone
-    yaw_target: float | None = None  # [rad] heading of the goal
+    yaw_target: float | None = None  # [rad] heading of the goal, NaN before the end of a path
 
 
 def check() -> None:
@@ -195,7 +195,7 @@ def _messages(steps: Iterable[Step]) -> Iterator[tuple[str, int, Message]]:
         child = {"header": odom, "child_frame_id": "base_link"}
         yield "/odom", stamp, {**child, "pose": pose, "twist": {"twist": _velocity(previous, step)}}
         yield "/target", stamp, {"header": odom, "point": _xyz(*step.target)}
-        if step.yaw_target is not None:
+        if step.yaw_target is not None and not math.isnan(step.yaw_target):
             x, y = step.target
             goal = _pose(x, y, step.yaw_target)
             yield "/goal", stamp, {"header": odom, "pose": goal}
@@ -289,8 +289,9 @@ def read(
     """Return the steps of a bag as arrays, by the fields of `Step` that it has, and `period`.
 
     A step is a command, with the latest message of each other topic that is not after it. Steps
-    begin when each topic has had a message, and end at a path without poses. A bag with `/taxels`
-    alone, as of a robot, has no `contact_type` and no `p_robot_contact`.
+    begin when each topic but `/goal` has had a message, and end at a path without poses. Before the
+    first `/goal`, headings are NaN. A bag with `/taxels` alone, as of a robot, has no
+    `contact_type` and no `p_robot_contact`.
 
     Args:
       path: of an MCAP file, of an sqlite3 file, or of a folder of `ros2 bag record`.
@@ -350,7 +351,8 @@ def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> Arra
     names[_END] = names["path"]
     series = {key: _in_order(names[key], log, clock) for key, log in logs.items()}
     commands, end = series.pop("cmd_vel"), series.pop(_END, None)
-    commands = commands.at(commands.time >= max(s.time[0] for s in series.values()))
+    begun = max(s.time[0] for key, s in series.items() if key != "goal")
+    commands = commands.at(commands.time >= begun)
     if end is not None and "path" in series:
         paths = series["path"]
         if (stops := end.time[end.time > paths.time[0]]).size:
@@ -368,11 +370,10 @@ def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> Arra
         row.check(_MAX_TILT if key == "odom" else None)
     _check_frames(rows)
     time = 1e-9 * commands.time
-    return {
-        "time": time,
-        "period": np.insert(np.diff(time), 0, np.median(np.diff(time))),
-        **{name: get(rows[key].values) for name, (key, get) in _FIELDS.items() if key in rows},
-    }
+    steps = {name: get(rows[key].values) for name, (key, get) in _FIELDS.items() if key in rows}
+    if "goal" in series:
+        steps["yaw_target"][commands.time < series["goal"].time[0]] = np.nan
+    return {"time": time, "period": np.insert(np.diff(time), 0, np.median(np.diff(time))), **steps}
 
 
 # --- messages as arrays --------------------------------------------------------------------
