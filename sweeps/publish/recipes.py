@@ -307,6 +307,21 @@ RECIPES: dict[str, Recipe] = {
         gpu=2,
         section="Flat against round",
     ),
+    "pose_drive*": recipe(
+        "rps sweeps/pose --cases 'wide, boxes | differential | 0.2 m/s' --worlds 1000 "
+        f"--seed 640209 --file pose_drive {_MACHINE}",
+        cores=10,
+    ),
+    "pose_paths": recipe(
+        "rps sweeps/pose/paths.py --cases "
+        + " ".join(
+            f"'paths, {kind} | {base} | 0.2 m/s'"
+            for kind in ("boxes", "prisms")
+            for base in ("omnidirectional", "differential")
+        )
+        + f" 'rooms, boxes | omnidirectional | 0.2 m/s' --worlds 300 {_MACHINE}",
+        cores=30,
+    ),
     "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 300 {_MACHINE}", cores=10),
     **dict.fromkeys(
         ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 10000 {_MACHINE}", gpu=2)
