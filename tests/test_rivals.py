@@ -369,6 +369,7 @@ def test_a_twist_is_within_the_speed_limits(name):
     limits = RIVALS[name]
     while hasattr(limits, "law"):
         limits = limits.law
+    limits = getattr(limits, "pose", limits)
     for x, y, z in default_rng(4).uniform(-1, 1, (16, 3)):
         for touching in (True, False):
             touch = observe((0.36, 0.3 * y), (3 * x, 3 * z), (y, z), 3 * x, touching)

@@ -130,7 +130,7 @@ def _simulate(
 ) -> Mapping[int, xr.Dataset]:
     """Return traces of trials of a law over time, by world; one batch for each object.
 
-    A warning names a trial that ends otherwise than in the sweep.
+    The attribute `differs` says whether a trial ends otherwise than in the sweep.
     """
     traces: dict[int, xr.Dataset] = {}
     objects = plan.object_of(worlds)
@@ -141,8 +141,9 @@ def _simulate(
         trajectories = pushes.record_batch(batch, plan.setting, **options)
         progress.finish(rows.size)
         outcomes = jax.tree.map(lambda *x: np.stack(x), *(x.outcome for x in trajectories))
-        find_differences(run, law, rows.tolist(), outcomes)
-        traces |= dict(zip(rows.tolist(), map(trace_dataset, trajectories), strict=True))
+        differ = find_differences(run, law, rows.tolist(), outcomes)
+        for i, trajectory, differs in zip(rows.tolist(), trajectories, differ, strict=True):
+            traces[i] = trace_dataset(trajectory).assign_attrs(differs=bool(differs))
     return traces
 
 
@@ -150,8 +151,9 @@ def trials_table(traces: Mapping[int, xr.Dataset]) -> Rows:
     """Return a row for the trace of each world: its end, and the path of the base."""
     rows = [["world", "end", "least distance", "path of the base"]]
     for world, trace in traces.items():
-        end, path = float(trace.outcome_time), float(trace.outcome_path_length)
-        rows.append([str(world), f"{end:.0f} s", _miss(trace), f"{path:.1f} m"])
+        end, path = f"{float(trace.outcome_time):.0f} s", float(trace.outcome_path_length)
+        end += ", ends otherwise than in the sweep" * trace.attrs.get("differs", False)
+        rows.append([str(world), end, _miss(trace), f"{path:.1f} m"])
     return rows
 
 
