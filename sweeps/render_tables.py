@@ -71,13 +71,10 @@ STALE: dict[str, str] = {
     ),
     **dict.fromkeys(
         (
-            "export_bags",
-            "export_inputs",
             "export_odd",
             "export_paper",
             "export_speed",
             "export_trials",
-            "export_worlds",
         ),
         "exported code tests the bits of numbers for NaN",
     ),

@@ -25,6 +25,7 @@ from sweeps.study_base import Study, Table, records, run_process, text_table
 WHY = {
     "* *learned*": "`learned` was trained in paths and between walls, too",
     "corridors_widths * rps": "lookahead 0.38 m, no longer 0.6 m: it is chosen in worlds of tuners",
+    "rivals_tuned *": "tuners got separate worlds, in which the search ends elsewhere",
     "*": "",
 }
 _INTERVAL = re.compile(r"([\d.]+)(?: %)? \[([\d.]+), ([\d.]+)\]")
