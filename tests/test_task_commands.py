@@ -10,7 +10,6 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
 from gymnasium.utils.env_checker import check_env
 from helpers import ROOT, refusal, refusing, rps, setting_of
@@ -139,10 +138,6 @@ def test_a_sweep_records_and_reports_the_outcomes_of_its_task(run):
     ]
     assert sum(int(cell.partition(": ")[2]) for cell in cells[0].split(", ")) == touched.sum()
     assert f"{np.median(trials.progress):.3g} [" in section
-    columns = pd.read_csv(run / "t.columns.csv").set_index("column")
-    for name in ("progress", "error_95", "clearance", "touch_x", "width", "turns"):
-        assert columns.meaning[name] == results[name].attrs["long_name"]
-        assert columns.unit[name] == results[name].attrs["units"]
     assert "fail at once" not in section
     plan = load_plan(run / "run")
     sections = {
