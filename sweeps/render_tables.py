@@ -73,7 +73,6 @@ STALE: dict[str, str] = {
         (
             "export_odd",
             "export_paper",
-            "export_speed",
             "export_trials",
         ),
         "exported code tests the bits of numbers for NaN",

@@ -481,10 +481,10 @@ def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
     Raises:
       TooLargeError: a kernel needs too much shared memory.
     """
-    few, many = _THREADS
+    fewest, most = _THREADS
     with contextlib.suppress(TooLargeError):
-        return few, _printed(functions, GpuWriter, few)
-    return many, _printed(functions, GpuWriter, many)
+        return fewest, _printed(functions, GpuWriter, fewest)
+    return most, _printed(functions, GpuWriter, most)
 
 
 def _printed(

@@ -351,8 +351,8 @@ def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> Arra
     names[_END] = names["path"]
     series = {key: _in_order(names[key], log, clock) for key, log in logs.items()}
     commands, end = series.pop("cmd_vel"), series.pop(_END, None)
-    begun = max(s.time[0] for key, s in series.items() if key != "goal")
-    commands = commands.at(commands.time >= begun)
+    first = max(s.time[0] for key, s in series.items() if key != "goal")
+    commands = commands.at(commands.time >= first)
     if end is not None and "path" in series:
         paths = series["path"]
         if (stops := end.time[end.time > paths.time[0]]).size:

@@ -180,7 +180,7 @@ def soften_skins(worlds: World) -> World:
     """Return worlds, or one, with smooth skins, unless these have a temperature.
 
     Raises:
-      InputError: the skin is ideal, which has no smooth form.
+      InputError: the skin is ideal: this has no smooth form.
     """
     skin, shape = worlds.skin, jnp.shape(worlds.p_world_target)[:-1]
     if isinstance(skin, IdealSkin):
