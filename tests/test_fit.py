@@ -23,6 +23,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
+from rps_jax.geometry import solid
 from rps_jax.record import bag
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import with_contacts
@@ -45,6 +46,51 @@ def log_table(count=400):
     return pd.DataFrame(0.0, range(count), COLUMNS.split(",")).assign(**values)
 
 
+def drive(delay=0, slip: Any = 0.0, blocked=0.0, noise=0.0, start=0.0, speed=0.1, period=0.02):
+    """Return the log of a base that slips, lags or is blocked for a share of its commands.
+
+    The slip is one number, or those of v_x, v_y and omega.
+    """
+    rng, time = default_rng(0), np.arange(0.0, 12.0, period)
+    count = len(time)
+    twist = np.stack([speed + 0 * time, 0.03 * np.sin(time), 0.3 * np.sin(0.7 * time)], -1)
+    blocks = (np.arange(count) % 200 < 200 * blocked)[:, None]
+    share = np.where(blocks, 0.0, 1 - np.array(slip))
+    done = share * np.concatenate([np.zeros((delay, 3)), twist[: count - delay]])
+    yaw = start + period * np.cumsum(done[:, 2])
+    velocity = solid.rotate(yaw, done)[:, :2]
+    pose = np.column_stack([period * np.cumsum(velocity, 0), yaw]) + noise * rng.normal(
+        size=(count, 3)
+    )
+    columns = dict(zip(("x", "y", "yaw", "v_x", "v_y", "omega"), (*pose.T, *twist.T), strict=True))
+    touch = {"contact_type": 1, "contact_x": 0.3625, "contact_y": 0.05}
+    return pd.DataFrame({"time": time, **columns, **touch, "target_x": 2.0, "target_y": 0.5})
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        {"delay": 25},
+        {"slip": 0.5},
+        {"slip": 0.9},
+        {"slip": (0.1, 0.9, 0.9)},
+        {"slip": (0.0, 0.2, 0.45)},
+        {"blocked": 0.7},
+        {"blocked": 1.0},
+        {"blocked": 1.0, "noise": 0.005, "speed": 0.3},
+        {"noise": 0.02},
+        {"start": 40.0},
+        {"speed": 0.0, "noise": 0.01},
+        {"delay": 2, "slip": 0.3, "blocked": 0.5, "period": 0.1},
+    ],
+    ids=str,
+)
+def test_imperfect_robots_have_no_wrong_units(faults, tmp_path):
+    table = drive(**faults)
+    log = logs.read(written(tmp_path / "log.csv", table), SHELL)
+    assert_allclose(log.columns["pose"], table[["x", "y", "yaw"]], atol=1e-9)
+
+
 def written(path, table):
     table.to_csv(path, index=False)
     return path
@@ -59,6 +105,7 @@ def put(column, value, where: Any = slice(None)):
 
 
 WRONG = {
+    "yaw may be in deg": lambda table: table.assign(yaw=10 * table.time),
     "lacks contact_y": lambda table: table.drop(columns="contact_y"),
     "has a gap of 2 s at": lambda table: table.drop(index=range(100, 199)),
     "lasts 1.9 s: it must last 5 s": lambda table: table[:95],

@@ -30,7 +30,7 @@ from rps_jax.robot import robot as robots
 from rps_jax.robot.robot import Robot, RobotLike
 from rps_jax.robot.skin import CapacitiveSkin, check_taxels, ends_of, with_contacts
 from rps_jax.runs.question import BagQuestion, Run, call_of
-from rps_jax.tuning.logs import COLUMNS
+from rps_jax.tuning.logs import COLUMNS, motion_faults
 from rps_jax.world.tasks.path import PathCourse
 
 _STILL = 1e-3  # [m] by which the points of a path may move
@@ -87,6 +87,8 @@ class Shadow(BagQuestion[xr.Dataset]):
         recorded |= {"twist": robot.twist_of_middle(recorded["twist"])}
         if "target" not in recorded:
             recorded |= {"target": pursued(recorded, self.lookahead)}
+        motion = (recorded[name] for name in ("time", "pose", "twist"))
+        doubts = "; it ".join(motion_faults(*motion))  # the base may follow other commands
         twists = shadowed(registry.law_of(self.params), self.params, recorded, robot)
         both = np.stack([recorded["twist"], twists])
         pairs = zip(COLUMNS["twist"].items(), np.moveaxis(both, -1, 0), strict=True)
@@ -94,7 +96,8 @@ class Shadow(BagQuestion[xr.Dataset]):
         if robot.drive != "omni":  # of which v_y follows from omega
             del columns["v_y"]
         coords = {"source": ["commanded", "law"], "time": recorded["time"]}
-        return xr.Dataset(columns, coords, {"law": registry.resolve_law(self.law)[0]})
+        attrs = {"law": registry.resolve_law(self.law)[0], "doubts": doubts}
+        return xr.Dataset(columns, coords, attrs)
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Return the differences between the twists of the law and the recorded ones."""
@@ -114,6 +117,8 @@ class Shadow(BagQuestion[xr.Dataset]):
             f"differences between the twists of {results.attrs['law']} and the recorded ones, at "
             "the same observations."
         )
+        if results.attrs.get("doubts"):
+            text += f" Check the bag: it {results.attrs['doubts']}."
         if count := int(is_nan.sum()):
             text += (
                 f" {results.attrs['law']} returned NaN or infinity at {count} of {is_nan.size} "

@@ -57,6 +57,13 @@ _SLOWEST = 0.2  # [s] between two rows, at most
 _JUMPS = (0.5, 0.5, 1.0)  # [m, m, rad] between two rows, at least
 _RARE = 0.02  # share of jumps that are no error of the unit of x or y, at most
 _STILL = 0.001  # [m] that a target may move
+# Motion is compared with commands over windows, so that noise and delays matter little.
+_WINDOW = 2.0  # [s]
+_RESOLUTION = 0.05  # [m] and [rad] of both motions
+_MISFIT = 5.0  # greatest ratio of motion to command, as root mean squares
+_LOST = 0.08  # least ratio of the two; wheels may lose 90 %
+_ALIGNED = 0.7  # similarity of the two at least, if the base moves less than commanded
+_FRAMES = "yaw may be in deg or rise clockwise, or v_x and v_y may be in the frame of x and y"
 _FIX = "write SI units, or name the unit in the title of a table, as 'time [ms]' or 'yaw [deg]'"
 
 LogLike = Trace | str | Path
@@ -203,6 +210,39 @@ def _faults(log: RawLog) -> Iterator[str]:
         change = " to ".join(f"{value:.3g}" for value in columns["pose"][i : i + 2, axis])
         change = f"{[*COLUMNS['pose']][axis]} from {change} in {at(i + 1)}"
         yield f"has a pose that jumps: {change}: cut the log there, or {_FIX}"
+    yield from motion_faults(time, columns["pose"], columns["twist"])
+
+
+def motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iterator[str]:
+    """Yield the contradictions of motion (N, 3) and commands (N, 3), by their units or frames.
+
+    A base that slips, lags, or is blocked for some time passes.
+    """
+    period = np.diff(time, append=time[-1])[:, None]
+    span = min(len(time) - 1, max(1, round(_WINDOW / float(np.median(period)))))
+    worlds = (rotate(yaw, twist) for yaw in (pose[:, 2], np.radians(pose[:, 2])))
+    integrals = (np.cumsum(x * period, axis=0) for x in (twist, *worlds))
+    moved, size, path, path_by_deg = (_over(x[None], span)[0] for x in (pose, *integrals))
+    for part, titles, units, commands, rates, least in (
+        (slice(2, 3), "yaw", "deg", "omega", "deg/s", -_ALIGNED),
+        (slice(2), "x and y", "mm or cm", "v_x and v_y", "mm/s or cm/s", 0.5),
+    ):
+        a, b = (np.linalg.norm(x[:, part]) / np.sqrt(len(x)) for x in (moved, size))
+        ratio = float(np.hypot(a, _RESOLUTION) / np.hypot(b, _RESOLUTION))
+        likeness, by_deg = (_similarity(moved[:, part], x[:, part]) for x in (path, path_by_deg))
+        if by_deg > max(0.9, likeness) and np.abs(pose[:, 2]).max() > 2 * np.pi:
+            least = 0.95
+        if ratio > _MISFIT or (ratio < _LOST and likeness > _ALIGNED):
+            suspect, unit = (titles, units) if ratio > 1 else (commands, rates)
+            fault = f"moves {ratio:.3g} times as far in {titles} as {commands} command"
+            yield f"has a base that {fault}: {suspect} may be in {unit}; {_FIX}"
+        elif likeness < least and 0.5 < ratio < 2:
+            yield f"has a base that does not move in the direction of {commands}: {_FRAMES}"
+
+
+def _similarity(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the cosine between vectors (N, k), of all entries together."""
+    return float(np.sum(a * b) / max(1e-12, np.linalg.norm(a) * np.linalg.norm(b)))
 
 
 def _unit_faults(columns: Arrays, shell: Shell) -> Iterator[str]:
@@ -211,7 +251,7 @@ def _unit_faults(columns: Arrays, shell: Shell) -> Iterator[str]:
     if not in_contact.any():
         yield "has no contact, so it has no information: log a push"
     object_pose = columns.get("object_pose", pose * [1, 1, 0])
-    turned = _over(object_pose[None, :, 2], round(2.0 / np.median(np.diff(columns["time"]))))
+    turned = _over(object_pose[None, :, 2], round(_WINDOW / np.median(np.diff(columns["time"]))))
     for titles, values, limit, unit in (
         ("v_x and v_y", columns["twist"][:, :2], 3.0, "m/s"),
         ("omega", columns["twist"][:, 2], 10.0, "rad/s"),
