@@ -208,12 +208,12 @@ def test_an_attack_fills_many_more_cells_than_drawn_worlds(synthetic):
 
 
 def test_a_killed_attack_resumes_with_the_same_results(synthetic, tmp_path):
-    short = SMALL | {"generations": 7, "drawn": 100}
+    short = SMALL | {"generations": 7, "drawn": 100, "check_again": 4}
     whole = rps_jax.attack("rps", "wide", **short)
     rps_jax.attack("rps", "wide", **short | {"generations": 5}, out=tmp_path)
     checkpoints = sorted((tmp_path / "parts").iterdir())
     checkpoints[3].write_bytes(b"damaged")
-    resumed = rps_jax.attack("rps", "wide", **short, out=tmp_path)
+    resumed = rps_jax.attack("rps", "wide", **short, out=tmp_path)  # the search goes on
     xr.testing.assert_identical(resumed.drop_attrs(), whole.drop_attrs())
     with refusing("holds another run"):
         rps_jax.attack("rps", "hostile", **short, out=tmp_path)
@@ -239,7 +239,8 @@ def test_the_command_searches_checks_lists_and_draws(tmp_path, capsys):
     out = tmp_path / "run"
     command = "attack --engine quasistatic --cells 2 --batch 8 --generations 2 --drawn 3 "
     command += f"--horizon 1 --check-again 2 --worst 2 --slots 8 --workers 1 --out {out}"
-    text = printed(capsys, command)
+    assert rps(command.replace("generations 2", "generations 1")) == 0
+    text = printed(capsys, command)  # the search goes on, with other elites
     assert "2 of 2 elites" in text
     assert f"rps replay {out / 'worlds'} 0 --law rps_tuned" in text
     assert [path.name for path in out.glob("*.png")] == ["archive.png"]

@@ -35,6 +35,8 @@ from rps_jax.analysis.figures.style import (
 )
 from rps_jax.engines import device
 from rps_jax.questions import LawQuestion, Picture, Plan, Run, Section, call_of, option
+from rps_jax.record import files
+from rps_jax.record import folder as run_folder
 from rps_jax.record.files import Arrays
 from rps_jax.runs import execution
 from rps_jax.runs.question import DomainQuestion, count_true
@@ -135,7 +137,8 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         order = np.random.default_rng(0).permutation(even)
         set_phase(run.callback, "check in C MuJoCo")
         setting = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
-        folder = run.folder and run.folder / "check"
+        # A search that continues for longer has other elites.
+        folder = run.folder and run.folder / f"check-{files.sha256(results.u.values.tobytes())[:8]}"
         probe = Probe(self.ranges, self.params, setting, run._replace(folder=folder))
         batch = max(1, run.workers or device.count_processors())
         for first in range(0, len(order), batch):
@@ -151,7 +154,10 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
             set_phase(run.callback, "worst worlds")
             at = points.check_points(self.ranges, results.u.values[: self.worst])
             plan = Plan(self.ranges, len(at.u), {self.label: self.params}, self.setting, points=at)
-            execution.run_plan(plan, run.folder / "worlds", **run.batch_options)
+            worst = run.folder / "worlds"
+            if run_folder.difference(worst, plan.configuration()):  # the worst of a shorter search
+                run_folder.remove_run(worst)
+            execution.run_plan(plan, worst, **run.batch_options)
 
     def intro(self, results: xr.Dataset) -> str:
         return (
