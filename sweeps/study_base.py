@@ -283,6 +283,11 @@ def run_process(words: Sequence[str | Path], problem: str, folder: Path | None =
     return process.stdout
 
 
+def use_processors() -> None:
+    """Let JAX of a new process run on processors, beside one that may hold the GPU."""
+    jax.config.update("jax_platforms", "cpu")
+
+
 def machine() -> str:
     """Return a description of the device of this process."""
     used, count = jax.devices()[0], len(os.sched_getaffinity(0))

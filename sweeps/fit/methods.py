@@ -33,7 +33,7 @@ from rps_jax.worlds import DomainLike
 from sweeps.fit import least_squares
 from sweeps.fit.least_squares import Replay, Track
 from sweeps.fit.study import FitStudy, within
-from sweeps.study_base import Rows, Table
+from sweeps.study_base import Rows, Table, use_processors
 
 KINDS = {"touch, object": ("object_pose",), "touch, object, force": ("object_pose", "f_robot")}
 METHODS = ("neural", "gradient", "evolution")
@@ -80,8 +80,8 @@ class Methods(FitStudy):
         has some logs and does not need the others. Networks learn meanwhile.
         """
         quiet = run._replace(callback=no_progress)
-        context, cpu = multiprocessing.get_context("spawn"), ("jax_platforms", "cpu")
-        with context.Pool(len(os.sched_getaffinity(0)), jax.config.update, cpu) as pool:
+        context = multiprocessing.get_context("spawn")
+        with context.Pool(len(os.sched_getaffinity(0)), use_processors) as pool:
             jobs = [
                 pool.starmap_async(_fit_part, [(self, quiet, method, i) for i in parts], 1)
                 for method, parts in self._parts.items()

@@ -23,7 +23,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-import jax
 import numpy as np
 import xarray as xr
 from scipy.io import loadmat
@@ -34,7 +33,7 @@ from rps_jax.questions import Run, call_of, option
 from rps_jax.tuning import objects
 from rps_jax.tuning.objects import PRIOR, Pushes
 from sweeps.real_pushes import pushes as triangle
-from sweeps.study_base import QuickStudy, Table, part_name, text_table
+from sweeps.study_base import QuickStudy, Table, part_name, text_table, use_processors
 
 RADIUS = 0.00475  # [m] of the finger
 LOGS, SHAPES = "mcube_data_proc/motion_model_eval_logs", "pnpush_matlab/get_shape.m"
@@ -211,11 +210,8 @@ class Mit(QuickStudy[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Fit each cell to 20 % of its pushes, and then to few with the prior of the others."""
         cores = len(os.sched_getaffinity(0))
-        context, choose = (
-            multiprocessing.get_context("spawn"),
-            partial(jax.config.update, "jax_platforms", "cpu"),
-        )
-        processes = ProcessPoolExecutor(cores, context, choose)
+        context = multiprocessing.get_context("spawn")
+        processes = ProcessPoolExecutor(cores, context, use_processors)
         with processes, ThreadPoolExecutor(2 * cores) as threads:
 
             def parts_of(kind: str, compute: Callable[[str], xr.Dataset]) -> list[xr.Dataset]:
