@@ -49,7 +49,6 @@ STALE: dict[str, str] = {
         ),
         "tuners got separate worlds, which no sweep meets",
     ),
-    **dict.fromkeys(("ground",), "a push ran in the program of a sweep, with other last bits"),
     **dict.fromkeys(
         ("engines_ideal", "engines_wide", "tasks_parity"),
         "objects got supports, with other last bits of C MuJoCo",
@@ -77,19 +76,9 @@ STALE: dict[str, str] = {
         ),
         "exported code tests the bits of numbers for NaN",
     ),
-    **dict.fromkeys(
-        ("sb3",),
-        "the value function of `rps learn` observes the room to walls",
-    ),
     "fit_one_push": "a sum in the solver got its former order back, with other last bits",
     **dict.fromkeys(
-        (
-            "force_push_paths",
-            "learned_failures",
-            "learned_test",
-            "learned_windows",
-            "million",
-        ),
+        ("learned_windows", "million"),
         "`learned` was trained between walls, too",
     ),
 }
