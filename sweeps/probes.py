@@ -59,8 +59,8 @@ PROBES = {
     "round": f"{_FAST} --domain wide --robot round {_SHORT}",
     "drives": f"sweep --worlds 24 --laws unicycle --robot ideal,drive=differential {_SHORT}",
     "pose": f"sweep --worlds 16 --laws pose --task pose --domain {_BOX} --horizon 60",
-    "pose_drive": "sweep --worlds 16 --laws pose_drive --task pose --robot "
-    f"ideal,drive=differential --domain {_BOX} --horizon 60",
+    "pose_drive": "sweep --worlds 16 --laws pose_drive,v_free=0.05,omega_free=0.15 --task pose "
+    f"--robot ideal,drive=differential --domain {_BOX} --horizon 60",
     "path": f"{_FAST} {_NETWORK} --task path {_SHORT}",
     "corridor": f"{_FAST} {_NETWORK} --task corridor {_SHORT}",
     "floor": f"{_FAST} --domain wide,slope=0:0.05,boundary_factor=1:2 {_SHORT}",

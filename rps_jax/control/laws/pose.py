@@ -600,6 +600,9 @@ _DRIVE = PoseParams(  # tuned in `wide` with boxes and a differential base
     beyond=0.05025,
     looks=1.0,
     tau=0.5982,
+    # Our choice: at the paper's speeds most of its manoeuvres take longer than 150 s.
+    v_free=0.2,
+    omega_free=0.5,
 )
 PRESETS = {
     "pose": PoseParams(),
