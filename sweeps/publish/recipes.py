@@ -84,6 +84,10 @@ _HARDWARE = {
 _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
 _IN_WIDE = "sweep --domain wide --worlds 1000 --seed 9243"
 _PRESETS = ("turtlebot4", "jackal", "husky", "mir100", "pioneer_3dx")
+_POSE_PRESETS = {
+    **dict.fromkeys(("turtlebot4", "jackal", "pioneer_3dx"), "pose_narrow"),
+    **dict.fromkeys(("husky", "mir100"), "pose_drive"),
+}
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
 _FORMER = "sweeps/learned/learned_0_4.npz"  # `learned` of 0.4
 _LEARNED = _filled(
@@ -360,6 +364,17 @@ RECIPES: dict[str, Recipe] = {
         gpu=2,
         section="Success",
         labels=(*_PRESETS, "f1tenth", "f1tenth, 600 s without contact"),
+        columns=("", "all", "median time", "timeout", "lost contact"),
+    ),
+    "pose_presets": recipe(
+        *(
+            "rps sweep --task pose --domain wide,objects=random_box --worlds 1000 --seed 9244 "
+            f"--robot {robot} --laws {law} --out runs/pose_{robot}"
+            for robot, law in _POSE_PRESETS.items()
+        ),
+        cores=10,
+        section="Success",
+        labels=tuple(_POSE_PRESETS),
         columns=("", "all", "median time", "timeout", "lost contact"),
     ),
     "corridors_*": recipe(
