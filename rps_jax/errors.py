@@ -84,6 +84,14 @@ def check_finite(name: str, value: Any, **bounds: Any) -> float:
     return scalar
 
 
+def check_angle(name: str, value: Any) -> float:
+    """Return a finite angle [rad] within 2 pi of 0, beyond which it may be in degrees."""
+    if abs(angle := check_finite(name, value)) > 6.3:
+        rule = "it is beyond 2 pi: give radians, as 1.571 for 90 degrees"
+        raise not_allowed(name, f"{angle:g}", rule)
+    return angle
+
+
 def check_vector(name: str, values: Iterable[object], **bounds: float | str) -> list[float]:
     """Return the finite numbers x and y within bounds: see `check_number`."""
     axes = zip("xy", values, strict=True)

@@ -190,8 +190,8 @@ class Path(Following):
 
     @property
     def shape(self) -> Hashable:
-        """Kind, number of the vertices, and whether there is a heading."""
-        return self.kind, len(self.waypoints), self.spline, self.heading is None
+        """Shape of a goal, and number of the vertices."""
+        return super().shape, len(self.waypoints), self.spline
 
     def check(self) -> None:
         """Raise InputError for waypoints that are no path."""

@@ -156,10 +156,13 @@ class Posed(Task):
 
     def __post_init__(self) -> None:
         for angle in self.heading[:2] if self.heading else ():
-            if abs(angle) > _TURN:
-                rule = "it is beyond 2 pi: give radians, as 1.571 for 90 degrees"
-                raise errors.not_allowed("task heading", f"{angle:g}", rule)
+            errors.check_angle("task heading", angle)
         super().__post_init__()
+
+    @property
+    def shape(self) -> Hashable:
+        """Kind, and whether there is a heading."""
+        return self.kind, self.heading is None
 
     @property
     def outcomes(self) -> Mapping[str, Spec]:
@@ -209,8 +212,8 @@ class Pose(Posed):
 
     @property
     def shape(self) -> Hashable:
-        """Name of the task, and whether the heading is relative."""
-        return self.kind, self.turn is None
+        """Shape of a goal, and whether its heading is relative."""
+        return super().shape, self.turn is None
 
     @property
     def idle(self) -> frozenset[str]:

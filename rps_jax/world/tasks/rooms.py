@@ -44,7 +44,6 @@ _OUTSIDE = "it lies in an obstacle or outside of the room (of an image, try a sm
 _MAX_WALLS = 4096
 _NEAR = 128  # walls of a world: those nearest to its path, if the map has more
 _MAX_CELLS = 1_000_000  # of the grid on which a path between more walls is planned
-_TURN_BOUNDS = {"at_least": -6.3, "at_most": 6.3, "unit": "rad"}  # no angle in degrees
 _MAX_PIXELS = 16_000_000
 # Vertices of a path around a corner, by the clearance: up to 1.08 times the clearance from it. An
 # arc is longer than the shortest by at most 5.5 %.
@@ -110,13 +109,8 @@ class Rooms(Following):
 
     @property
     def shape(self) -> Hashable:
-        """Kind, numbers of routes and vertices, and of ends of walls: one more in large maps."""
-        return (
-            self.kind,
-            self._routes.shape,
-            min(len(self.walls), 2 * _NEAR + 1),
-            self.heading is None,
-        )
+        """Shape of a goal, of the routes, and number of ends of walls: one more in large maps."""
+        return super().shape, self._routes.shape, min(len(self.walls), 2 * _NEAR + 1)
 
     @property
     def idle(self) -> frozenset[str]:
@@ -172,7 +166,7 @@ class Rooms(Following):
             if self.heading.low != self.heading.high:
                 rule = "give one heading in the map, so that a path can be planned"
                 raise errors.not_allowed("task heading", self.heading, rule)
-            clearance = (self.base_radius + self.object_radius) / self.scale.low
+            clearance = self.free_room / self.scale.low
             first, goals = self._last_lines
             pairs = (np.array(self.walls) @ (1, 1j)).reshape(-1, 2).T
             away = distances(first[:, None], goals[:, None], *pairs).min()
@@ -183,9 +177,9 @@ class Rooms(Following):
                 rule += f"{clearance:.2f} m from walls, and one is {away:.2f} m away"
                 raise errors.not_allowed("task heading", f"{self.heading.low:g}", rule)
         for _, _, yaw in self.start:
-            errors.check_finite("yaw of task start", yaw, **_TURN_BOUNDS)
+            errors.check_angle("yaw of task start", yaw)
         _, reach = self._near
-        least = 2 * (self.base_radius + self.object_radius)
+        least = 2 * self.free_room
         if reach is not None and reach.min() < least:
             rule = f"the {_NEAR} nearest to the path reach {reach.min():.2g} m from it, and must "
             fix = f"reach {least:.2g} m: give a larger tolerance [m] of an image, or specks [m2]"
@@ -259,7 +253,7 @@ def _read_image(file: JsonObject, starts: object) -> list[np.ndarray]:
     high = check("task occupied_thresh", file.get("occupied_thresh", 0.65), at_most=1)
     low = check("task free_thresh", file.get("free_thresh", 0.196), at_most=1)
     x, y, yaw = errors.check_array("task origin", file.get("origin", (0, 0, 0)), (3,))
-    check("yaw of task origin", yaw, **_TURN_BOUNDS)
+    errors.check_angle("yaw of task origin", yaw)
     texts = dict[str, str]()
     for name, allowed in {"negate": ("0", "1", "false", "true"), "mode": ("trinary",)}.items():
         texts[name] = str(file.get(name, allowed[0])).lower().removesuffix(".0")
