@@ -1,5 +1,6 @@
 """Pushes by one round finger, and objects that are fitted to them."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -188,3 +189,23 @@ def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_
     message = refusal(capsys, "fit object", *paths, "--out", tmp_path / "refused")
     assert "lacks yaw: rename its columns" in message
     assert not (tmp_path / "refused").exists()
+
+
+WITH_UNIT = {name: unit for name, unit in objects._COLUMNS.items() if unit}
+
+
+@pytest.mark.parametrize("names", [*map("{}".format, WITH_UNIT), "x y tip_x tip_y"])
+def test_tables_in_other_units_are_refused_before_a_compilation(
+    measured, tmp_path, capsys, compiled, names
+):
+    table, unit = table_of(Pushes(*(x[:6] for x in measured))), WITH_UNIT[names.split()[0]]
+    table["time"] *= 50 if " " in names else 1  # so slow that the speed in mm/s is not refused
+    for name in names.split():
+        table[name] *= {"s": 1e3, "m": 1e3, "rad": 180 / np.pi}[unit]
+    table.to_csv(tmp_path / "pushes.csv", index=False)
+    pd.DataFrame(SQUARE, columns=["x", "y"]).to_csv(tmp_path / "outline.csv", index=False)
+    paths, count = [tmp_path / "outline.csv", tmp_path / "pushes.csv"], len(compiled)
+    message = refusal(capsys, "fit object", *map(str, paths), "--out", tmp_path / "run")
+    assert re.search(rf"= .* is not allowed: .* give .*\b{unit}\b", message), message
+    assert len(compiled) == count
+    assert not (tmp_path / "run").exists()

@@ -185,10 +185,10 @@ def distances(p: Entries, q: Entries, a: Entries, b: Entries) -> np.ndarray:
     return np.where(crosses, 0.0, functools.reduce(np.minimum, lengths))
 
 
-def is_inside(point: complex, a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether a ray from a point crosses an odd number of segments from a to b."""
-    passed = (a.imag > point.imag) != (b.imag > point.imag)
-    return bool(np.sum(passed & ((_side(point, a, b) > 0) == (b.imag > a.imag))) % 2)
+def is_inside(point: Entries, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return whether rays from points (..., 1) cross an odd number of segments from a to b (N,)."""
+    passed = (a.imag > np.imag(point)) != (b.imag > np.imag(point))
+    return np.sum(passed & ((_side(point, a, b) > 0) == (b.imag > a.imag)), axis=-1) % 2 == 1
 
 
 def to_segment(point: Entries, a: Entries, b: Entries) -> np.ndarray:

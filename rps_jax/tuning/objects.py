@@ -28,7 +28,7 @@ from scipy.optimize import least_squares
 from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.engines import finger
-from rps_jax.geometry import planar, solid
+from rps_jax.geometry import planar, polyline, solid
 from rps_jax.geometry.arrays import Pair
 from rps_jax.record import table
 from rps_jax.record.options import option
@@ -67,6 +67,9 @@ _APART = 1e-3  # [m] gap at the end of a push whose finger no longer touches
 _MOST_GAP = 5e-4  # [m] median gap at the end that a fit leaves, at most
 _FOOT = 1e-3  # [m] radius of a known foot
 _INSIDE = 5e-3  # [m] of the finger in the object at the start, at most
+# Beyond these, numbers are in other units: [m/s] median speed of the finger, [m] median gap at the
+# end, and motion of the object over that of the finger, of which sliding objects have at most 1.
+_SPEEDS, _AWAY, _CARRIED = (5e-4, 5.0), 0.02, 2.0
 # Scatter of a prediction, from other objects: a constant and a share of the motion. Quantiles of
 # errors over the scatter at 90 %, and the number of pushes that they count for in a fit.
 _SCATTER = {"place": (3e-4, 0.045), "turn": (5e-3, 0.075)}
@@ -91,10 +94,14 @@ class Pushes(NamedTuple):
     start: np.ndarray  # (n, 3) [m, m, rad] measured pose of the object before
     end: np.ndarray  # (n, 3) after; NaN where unknown
 
-    def start_gaps(self, outline: ArrayLike, radius: float) -> np.ndarray:
+    def gaps(self, outline: ArrayLike, radius: float, at_end: bool = False) -> np.ndarray:
         """Return the gaps (n,) [m] between outline and finger at the start, negative inside."""
-        points = solid.rotate(-self.start[:, 2], self.path[:, 0] - self.start[:, :2])
-        return finger.distances(outline, points) - radius
+        pose = self.end if at_end else self.start
+        points = solid.rotate(-pose[:, 2], self.path[:, -at_end] - pose[:, :2])
+        p, a = (points @ (1, 1j))[:, None], np.asarray(outline) @ (1, 1j)
+        ends = a, np.roll(a, -1)
+        away = polyline.to_segment(p, *ends).min(axis=1)
+        return np.where(polyline.is_inside(p, *ends), -away, away) - radius
 
 
 PushesLike = str | Path | pd.DataFrame | Pushes
@@ -107,7 +114,8 @@ def read_pushes(pushes: PushesLike) -> Pushes:
     `tip_x`, `tip_y` [m] of the finger.
 
     Raises:
-      InputError: the table lacks a column or numbers, or the times of a push do not increase.
+      InputError: the table lacks a column or numbers, has other units, or the times of a push do
+        not increase.
     """
     if isinstance(pushes, Pushes):
         return pushes
@@ -115,17 +123,25 @@ def read_pushes(pushes: PushesLike) -> Pushes:
     if not isinstance(pushes, pd.DataFrame):
         pushes = table.read(Path(pushes), name, _COLUMNS.get)
     table.require(pushes, name, _COLUMNS)
-    rows = pushes[list(_COLUMNS)].apply(pd.to_numeric, errors="coerce").to_numpy(float)
+    numbers = pushes[list(_COLUMNS)].apply(pd.to_numeric, errors="coerce")
+    rows = numbers.to_numpy(float)
     if not len(rows) or not np.isfinite(rows).all():
         raise errors.not_allowed("pushes", "a table with gaps", "give finite numbers, m and rad")
-    if abs(rows[:, [2, 3, 5, 6]]).max() > 50 or abs(rows[:, 4]).max() > 50:
-        largest = f"numbers up to {abs(rows[:, 2:]).max():.3g}"
-        raise errors.not_allowed("pushes", largest, "give x and y in m and yaw in rad")
+    largest = numbers[[name for name, unit in _COLUMNS.items() if unit == "m"]].abs().max()
+    if largest.max() > 50:
+        rule = "it is at most 50 m: give x and y in m and yaw in rad"
+        raise errors.not_allowed(str(largest.idxmax()), f"up to {largest.max():.3g}", rule)
     parts = [rows[rows[:, 0] == name] for name in dict.fromkeys(rows[:, 0])]
     for part in parts:
         if len(part) < 2 or (np.diff(part[:, 1]) <= 0).any():
             rule = "give 2 or more rows whose times increase"
             raise errors.not_allowed("time", f"that of push {part[0, 0]:g}", rule)
+        errors.check_angle(f"yaw at the start of push {part[0, 0]:g}", part[0, 4])
+    ways = (np.linalg.norm(np.diff(part[:, 5:], axis=0), axis=1).sum() for part in parts)
+    speeds = [way / np.ptp(part[:, 1]) for way, part in zip(ways, parts, strict=True)]
+    if not _SPEEDS[0] <= (speed := np.median(speeds)) <= _SPEEDS[1]:
+        rule = "it is {:g} to {:g} m/s: give time in s, tip_x and tip_y in m".format(*_SPEEDS)
+        raise errors.not_allowed("speed of the finger", f"{speed:.2g} m/s (median)", rule)
     length = max(map(len, parts))
     path = [np.concatenate([x[:, 5:], np.repeat(x[-1:, 5:], length - len(x), 0)]) for x in parts]
     return Pushes(np.array(path), *(np.array([x[i, 2:5] for x in parts]) for i in (0, -1)))
@@ -310,6 +326,35 @@ def errors_of(pose: np.ndarray, end: np.ndarray) -> dict[str, np.ndarray]:
     return {"place": np.linalg.norm(pose[:, :2] - end[:, :2], axis=1), "turn": turn}
 
 
+def _half_size(outline: np.ndarray) -> float:
+    return float(np.ptp(outline, axis=0).max()) / 2
+
+
+def _check(corners: np.ndarray, data: Pushes, radius: float, prior: Mapping) -> None:
+    """Raise InputError for inputs of a fit that make no sense, before anything is compiled."""
+    errors.check_finite("radius", radius, at_least=1e-4, at_most=0.5, unit="m")
+    count = len(data.path)
+    if (unknown := set(prior) - set(PRIOR)) or any(sd <= 0 for _, sd in prior.values()):
+        errors.check_name("parameter of the prior", min(unknown, default=""), PRIOR)
+    if not 3 <= count <= _MAX_PUSHES:
+        raise errors.not_allowed("pushes", count, f"give 3 to {_MAX_PUSHES}, better 5 or more")
+    gaps = data.gaps(corners, radius)
+    if gaps[i := int(gaps.argmin())] < -_INSIDE:
+        rule = f"it starts {-1e3 * gaps[i]:.1f} mm inside the object; check outline and units"
+        raise errors.not_allowed("pushes", f"push {i}", rule)
+    turns = np.abs(data.end[:, 2] - data.start[:, 2])
+    turns = np.where(turns < 2 * np.pi, np.abs(solid.wrap(turns)), turns) * _half_size(corners)
+    moved = np.linalg.norm(data.end[:, :2] - data.start[:, :2], axis=1)
+    way = np.linalg.norm(np.diff(data.path, axis=1), axis=2).sum()
+    for name, unit, motion in (("x and y", "m", moved), ("yaw", "rad", turns)):
+        if (ratio := np.nansum(motion) / max(way, 1e-9)) > _CARRIED:
+            rule = f"the finger carries an object at most {_CARRIED:g} times as far: give {unit}"
+            raise errors.not_allowed(name, f"{ratio:.3g} times the way of the finger", rule)
+    if (gap := np.median(np.nan_to_num(np.abs(data.gaps(corners, radius, at_end=True))))) > _AWAY:
+        rule = f"the finger is {gap:.3g} m away: give x, y, tip_x, tip_y in m and yaw in rad"
+        raise errors.not_allowed("pushes", "without a contact at the end", rule)
+
+
 def fit(
     outline: ArrayLike,
     pushes: PushesLike,
@@ -318,25 +363,11 @@ def fit(
     feet: ArrayLike | None = None,
 ) -> ObjectFit:
     """Fit an object to measured pushes: see `FitObject`."""
-    corners = finger.check_outline(outline)
-    data = read_pushes(pushes)
-    errors.check_finite("radius", radius, at_least=1e-4, at_most=0.5, unit="m")
-    if (unknown := set(prior) - set(PRIOR)) or any(sd <= 0 for _, sd in prior.values()):
-        errors.check_name("parameter of the prior", min(unknown, default=""), PRIOR)
-    count = len(data.path)
-    if count < 3:
-        raise errors.not_allowed("pushes", count, "give 3 or more, better 5")
+    corners, data = finger.check_outline(outline), read_pushes(pushes)
+    _check(corners, data, radius, prior)
     mean, deviation = np.array([{**PRIOR, **prior}[name] for name in PRIOR]).T
-    if count > _MAX_PUSHES:
-        raise errors.not_allowed("pushes", count, f"give at most {_MAX_PUSHES}")
     pads = finger.uniform_pads(corners) if feet is None else _pads_of(feet)
-    fixed, size = _fixed(corners, pads, radius), float(np.ptp(corners, axis=0).max()) / 2
-    first = _batched(_simulate, mean, fixed, data)[1]
-    if (first[:, 0] < -_INSIDE).any():
-        i = int(np.argmin(first[:, 0]))
-        rule = f"it starts {-1e3 * first[i, 0]:.1f} mm inside the object; check outline and units"
-        raise errors.not_allowed("pushes", f"push {i}", rule)
-
+    fixed, size = _fixed(corners, pads, radius), _half_size(corners)
     turn = size * solid.wrap(data.end[:, 2] - data.start[:, 2])
     way = np.linalg.norm(data.end[:, :2] - data.start[:, :2], axis=1)
     unit = _LOSS[0] + _LOSS[1] * np.nan_to_num(np.abs(np.stack([way, way, turn], axis=1)))
@@ -394,7 +425,7 @@ def _traits(outline: np.ndarray, pushes: Pushes) -> np.ndarray:
     """Return coordinates (n, 6) of pushes between which a Gaussian process interpolates."""
     yaw, way = -pushes.start[:, 2], pushes.path[:, -1] - pushes.path[:, 0]
     way = way / np.maximum(np.linalg.norm(way, axis=1), 1e-9)[:, None]
-    at = (pushes.path[:, 0] - pushes.start[:, :2]) / (np.ptp(outline, axis=0).max() / 2)
+    at = (pushes.path[:, 0] - pushes.start[:, :2]) / _half_size(outline)
     turned = solid.rotate(yaw, at), solid.rotate(yaw, way), solid.unit(yaw)
     return np.concatenate([x / near for x, near in zip(turned, _NEAR, strict=True)], axis=1)
 
@@ -475,7 +506,7 @@ class FitObject(Question[ObjectFit]):
 
     def check(self) -> None:
         super().check()
-        _ = self._inputs
+        _check(*self._inputs, self.radius, self.prior or PRIOR)
 
     def answer(self, run: Run) -> ObjectFit:
         return fit(*self._inputs, self.radius, self.prior or PRIOR, self.feet)

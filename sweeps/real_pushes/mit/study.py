@@ -167,7 +167,7 @@ def _clean_split(folder: Path, label: str, cell: Cell) -> tuple[Cell, np.ndarray
 
 def _unbroken(cell: Cell, rows: np.ndarray) -> np.ndarray:
     """Return the rows whose finger does not start within the object."""
-    return rows[cell.pushes.start_gaps(cell.outline, cell.radius)[rows] > -_INSIDE]
+    return rows[cell.pushes.gaps(cell.outline, cell.radius)[rows] > -_INSIDE]
 
 
 def _order(cell: Cell, draw: int) -> np.ndarray:
