@@ -32,6 +32,15 @@ def push(count: int = ROWS, **changes: Any) -> pd.DataFrame:
     return pd.DataFrame(values, range(count)).round(9)
 
 
+def straight(heading: float) -> pd.DataFrame:
+    """Return the log of a base that turns little from a heading [deg], with angles in degrees."""
+    table = push()
+    omega = 0.05 * np.sin(0.7 * table.time)
+    yaw = np.radians(heading) + 0.02 * np.cumsum(omega)
+    x, y = (0.1 * 0.02 * np.cumsum(f(yaw)) for f in (np.cos, np.sin))
+    return table.assign(x=x, y=y, yaw=np.degrees(yaw), omega=np.degrees(omega))
+
+
 def known_object(**changes: Any) -> Change:
     """Return a change that adds the pose of the object and the force on the base."""
 
@@ -109,6 +118,7 @@ CASES: dict[str, Case] = {
     "binary": Case(lambda: bytes(range(1, 256)) * 9, "is no table|lacks time"),
     # Titles and units.
     "other units": Case(text(units(**OTHER))),
+    "nanoseconds": Case(text(units(time=("time [ns]", 1e9)))),
     "unknown unit": Case(
         text(renamed(x="x [px]")), r"unit of the column 'x \[px\]' in .*: 'px': choose from m, cm"
     ),
@@ -144,6 +154,7 @@ CASES: dict[str, Case] = {
     # Times.
     "Unix stamps": Case(text(lambda t: t.assign(time=t.time + 1_772_360_100)), "later"),
     "milliseconds": Case(text(scaled(time=1e3)), r"a row every 20 s.*'time \[ms\]'"),
+    "nanoseconds as seconds": Case(text(scaled(time=1e9)), r"a row every 2e[+]07 s"),
     "time falls": Case(text(cell(9, "time", 0)), "its time must rise, and is 0 s in row 11"),
     "time repeated": Case(text(lambda t: t.assign(time=t.time.round(1))), "its time must rise"),
     # Units that no title names.
@@ -162,11 +173,37 @@ CASES: dict[str, Case] = {
     "object in mm": Case(
         text(known_object(object_x=-600)), "object_x and object_y up to 600 m, beyond"
     ),
+    "object in degrees": Case(
+        text(known_object(object_yaw=45.0)), "object_yaw up to 45 rad, beyond"
+    ),
     "turning object in degrees": Case(
         text(lambda t: known_object()(t).assign(object_yaw=DEG * (t.yaw - 2.9))),
         "object_yaw up to 31.64 rad, beyond",
     ),
+    "yaw in degrees": Case(text(scaled(yaw=DEG)), "yaw may be in deg"),
+    "yaw and omega in degrees": Case(text(scaled(yaw=DEG, omega=0.5 * DEG)), "yaw may be in deg"),
+    "yaw and omega in degrees, almost straight": Case(
+        lambda: straight(50.0).to_csv(index=False).encode(), "yaw may be in deg"
+    ),
+    "omega in degrees": Case(text(scaled(omega=DEG)), "omega may be in deg/s"),
+    "position in mm": Case(text(scaled(x=MM, y=MM)), "x and y may be in mm"),
+    "position in cm": Case(text(scaled(x=100, y=100)), "x and y may be in mm or cm"),
     "speed in mm/s": Case(text(scaled(v_x=MM)), "v_x and v_y may be in mm/s"),
+    "speed in cm/s": Case(text(scaled(v_x=100)), "v_x and v_y may be in mm/s or cm/s"),
+    "contact in mm": Case(text(scaled(contact_x=MM, contact_y=MM)), "contact_y may be in mm"),
+    "contact in cm": Case(
+        text(scaled(contact_x=100, contact_y=100)), "contact_y may be in mm or cm"
+    ),
+    "all lengths and speeds in mm": Case(
+        text(lambda t: t.assign(**{k: MM * t[k] for k in ("x", "y", "v_x", "contact_x")})),
+        "v_x and v_y up to 100 m/s, beyond the limit of 3",
+    ),
+    "twist in the world": Case(
+        text(lambda t: t.assign(v_x=0.1 * np.cos(t.yaw), v_y=0.1 * np.sin(t.yaw))),
+        "v_x and v_y may be in the frame of x and y",
+    ),
+    "x mirrored": Case(text(scaled(x=-1.0)), "does not move in the direction of v_x and v_y"),
+    "omega clockwise": Case(text(scaled(omega=-1.0)), "does not move in the direction of omega"),
     "jump": Case(
         text(lambda t: t.assign(x=t.x + 3 * (t.index >= 200))),
         "pose that jumps: x from .* in row 202",
