@@ -240,6 +240,20 @@ def test_the_page_plays_a_push(page, browser):
     until(lambda: "Pause" in text())
 
 
+@pytest.mark.parametrize(
+    "task", ["reach", "pose", "pose,turn=1", "path", "path,heading=1", "corridor"]
+)
+def test_a_target_has_handles_where_it_can_be_moved(page, task, monkeypatch):
+    push = viewer.View("box", task=task, setting=SETTING).push()
+    monkeypatch.setattr(push.live, "step", lambda count=1: None)
+    page._show_built(lambda: push)
+    target, is_fixed = page._drawing.target, task.startswith(("path", "corridor"))
+    with refusing("the task has its own end") if is_fixed else contextlib.nullcontext():
+        push.live.set_target((1.0, 1.0), 0.5)
+    assert target.disable_axes == target.disable_sliders == is_fixed
+    assert target.disable_rotations == (task != "pose")
+
+
 def test_the_panel_of_a_task_has_progress_and_touch(page):
     waypoints = [[0.4, 0.0], [2.0, 0.0], [3.2, 1.2]]
     task = {"kind": "corridor", "waypoints": waypoints, "width": 0.9, "lookahead": 3}

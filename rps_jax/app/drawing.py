@@ -62,10 +62,13 @@ def furnish(server: ViserServer) -> None:
 class Drawing:
     """Bodies, paths and arrows of the current push in the 3-D scene."""
 
-    def __init__(self, server: ViserServer, scene: Scene, turns: bool = False) -> None:
+    def __init__(
+        self, server: ViserServer, scene: Scene, has_heading: bool = False, fixed: bool = False
+    ) -> None:
         """Add the bodies of a scene, in place of the last push.
 
-        With `turns`, the target has a heading, which an arrow shows and a hand can turn.
+        An arrow shows the heading of a target that has one. A hand can move and turn the target
+        unless it is `fixed`.
         """
         world = self._world = server.scene
         world.remove_by_name(_ROOT)
@@ -75,11 +78,13 @@ class Drawing:
             TARGET,
             scale=0.45,
             active_axes=(True, True, False),
-            disable_rotations=not turns,
+            disable_axes=fixed,
+            disable_sliders=fixed,
+            disable_rotations=fixed or not has_heading,
             depth_test=False,
             opacity=0.7,
         )
-        if turns:  # the arrow ends at the target
+        if has_heading:  # the arrow ends at the target
             tail, shape = np.array([[[-0.4, 0, 0.02], [0, 0, 0.02]]]), {"head_length": 0.12}
             colour = _rgb(rendering.PATH_RGBA)
             world.add_arrows(f"{TARGET}/heading", tail, colour, shaft_radius=0.02, **shape)

@@ -31,7 +31,7 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, load_plan, scene_of, world_title
 from rps_jax.runs.push import case_options, end_in_words, program_slots, select_law
-from rps_jax.runs.question import Command, call_of, set_period
+from rps_jax.runs.question import Command, call_of, suit_robot
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.live import CHUNK, Live, yaw_target
@@ -79,7 +79,7 @@ class View(Command[None], Case):
 
     def __post_init__(self) -> None:
         """Set the control period of the robot; defer the checks of `Case` to `check`."""
-        set_period(self, self.robot)
+        suit_robot(self, self.robot)
 
     @property
     def case(self) -> Case:
@@ -216,8 +216,9 @@ class Page:
         self._push, self._error = push, ""
         self._cursor, self._drawn, self._playing = 0.0, (0, 0), True
         with self._server.atomic():
-            self._drawing = Drawing(self._server, push.scene, push.live.yaw_target is not None)
-            self._drawing.draw_lines(push.live.lines)
+            live, has_heading = push.live, push.live.yaw_target is not None
+            self._drawing = Drawing(self._server, push.scene, has_heading, live.has_own_end)
+            self._drawing.draw_lines(live.lines)
             self._connect(self._drawing.target.on_update, self._drag)
 
     def _advance(self, live: Live, elapsed: float) -> None:

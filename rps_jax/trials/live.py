@@ -91,6 +91,11 @@ class Live:
         """Lines of the task for pictures: see `Course.lines`."""
         return rows(self._worlds.task, 0).lines()
 
+    @property
+    def has_own_end(self) -> bool:
+        """Whether the task has its own end, so that the target cannot be moved."""
+        return "path" in self.lines
+
     def memory_at(self, index: int) -> Memory:
         """Return what the law remembers before a step of `past`."""
         return memory_of(rows(self._params, 0), self.past[index].trial.law_state)
@@ -133,7 +138,7 @@ class Live:
         Raises:
           InputError: it is not finite, or out of bounds, or the task has its own end.
         """
-        if "path" in self.lines:
+        if self.has_own_end:
             raise errors.not_allowed("target", p_world_target, "the task has its own end")
         target = errors.check_vector("target", p_world_target, at_least=-50, at_most=50, unit="m")
         dtype = self._worlds.p_world_target.dtype
