@@ -6,7 +6,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from helpers import decode, refusing, rps, setting_of
+from helpers import decode, refusal, refusing, rps, setting_of
 
 from rps_jax.app import film
 from rps_jax.app.cli import flags
@@ -45,11 +45,16 @@ def in_order(takes, name="labels"):
     return film._in_grid_order([getattr(take, name) for take in takes], takes)
 
 
-def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(tmp_path, monkeypatch):
+def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(film, "_FILM_SIZE", (640, 360))  # smaller is drawn sooner
     open_run(tmp_path, plan_of("random_cylinder"))
     out = tmp_path / "two.mp4"
     assert rps(f"film {tmp_path} --grid 2x4 --seconds 2 --speed 4.8 --out {out}") == 0
+    content = out.read_bytes()
+    assert "exists: choose another file" in refusal(capsys, f"film {tmp_path} --out {out}")
+    assert out.read_bytes() == content
+    assert film.Film(tmp_path, out=out).in_free_place().out == tmp_path / "two-2.mp4"
+    assert film.Film(tmp_path, out=out, overwrite=True).in_free_place().out == out
     images = decode(out)
     # 20 control steps of 0.02 s a frame: at 0, 0.4, ... 2 s, and the last for a second more.
     assert images.shape == (6 + FPS, 180, 2 * 320, 3)  # two worlds fill the picture

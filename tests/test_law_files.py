@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import ROOT, refusing, rps, setting_of
 from numpy.testing import assert_allclose
 
 from rps_jax import evaluate, push, sweep
+from rps_jax.analysis import tables
 from rps_jax.app.shadow import shadowed
 from rps_jax.control import registry
 from rps_jax.record import files
@@ -86,13 +88,35 @@ def step(params, state, obs):
     assert not results.sel(law="rps").nan_twist.any()
 
 
-def test_the_commands_warn_that_the_law_returned_nan(tmp_path):
+def test_the_commands_warn_that_the_law_returned_nan(tmp_path, capsys):
     path = write_law(tmp_path, "v_y = jnp.inf * details.distance")
     brief = "--engine mujoco --horizon 0.2"
     with pytest.warns(UserWarning, match="a law returned NaN"):
         assert rps(f"sweep --worlds 2 --laws {path} {brief} --out", tmp_path / "s") == 0
+    assert "| mine | 2 of 2" in capsys.readouterr().out
     with pytest.warns(UserWarning, match="a law returned NaN"):
         evaluate(registry.LAWS["mine"], worlds=2, setting=BRIEF)
+
+
+NAN = {
+    "laws": (("law", "world"), {"law": ["a", "b"]}, ["b"]),
+    "one law": (("world",), {}, ["the law"]),
+    "rows of a shard": (("row",), {"law": ("row", ["a", "b", "b"])}, ["b"]),
+}
+
+
+@pytest.mark.parametrize("kind", NAN)
+def test_the_table_of_a_report_names_laws_that_returned_nan(kind):
+    dims, coords, names = NAN[kind]
+    is_nan = np.array([[0, 0, 0], [0, 1, 0]]) if len(dims) == 2 else np.array([0, 1, 0])
+    outcomes = {"nan_twist": (dims, is_nan), "time": (dims, 2.0 + 0 * is_nan)}
+    results = xr.Dataset(outcomes, coords)
+    for data in (results, xr.DataTree(children={"wide": xr.DataTree(results)})):
+        _, *rows = tables.nan_table(data)
+        assert [row[0] for row in rows] == names
+        count = 2 if kind == "rows of a shard" else 3
+        assert rows[0][1:] == [f"1 of {count}", "2.00 s"]
+    assert len(tables.nan_table(results.assign(nan_twist=0 * results.nan_twist))) == 1
 
 
 def test_a_push_says_that_the_law_returned_nan(tmp_path):

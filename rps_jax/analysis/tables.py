@@ -143,6 +143,23 @@ def task_table(results: xr.Dataset) -> list[list[str]]:
     return rows if len(rows) > 1 else []
 
 
+def nan_table(results: xr.Dataset | xr.DataTree) -> list[list[str]]:
+    """Return a row for each law that returned NaN or infinity, of results of trials by any axes."""
+    rows = [["law", "trials that it ended", "first at"]]
+    for node in (
+        xr.DataTree(results).subtree if isinstance(results, xr.Dataset) else results.subtree
+    ):
+        if "nan_twist" not in node or not node.nan_twist.any():
+            continue
+        laws = node.get("law", xr.DataArray("the law"))
+        is_nan, laws, time = (x.values for x in xr.broadcast(node.nan_twist > 0, laws, node.time))
+        for law in np.unique(laws[is_nan]):
+            mask = is_nan & (laws == law)
+            count = f"{mask.sum()} of {(laws == law).sum()}"
+            rows.append([str(law), count, f"{time[mask].min():.2f} s"])
+    return rows
+
+
 def models_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each law: its success rate on every model, and the range of the rates.
 

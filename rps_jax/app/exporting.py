@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rps_jax.app.export import program as programs
 from rps_jax.app.export.program import Program
-from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import not_allowed
 from rps_jax.lowering.routine import identifier
@@ -16,6 +15,7 @@ from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike, parse_robot
 from rps_jax.robot.skin import SkinLike
 from rps_jax.runs.question import Command, call_of
+from rps_jax.trials.case import suited_laws
 from rps_jax.trials.progress import ProgressCallback
 
 
@@ -42,7 +42,7 @@ class Export(Command[Path]):
         """Traced law and skin."""
         law = self.law
         if law is None:
-            law = registry.default_law(parse_robot(self.robot), "rps_plus")
+            (law,) = suited_laws(parse_robot(self.robot), laws=["rps_plus"])
         return programs.program(law, self.robot, self.skin)
 
     @property

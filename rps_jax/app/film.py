@@ -23,7 +23,7 @@ from rps_jax.record import files, folder
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, scene_of
 from rps_jax.runs.push import find_differences, program_slots, select_law
-from rps_jax.runs.question import Command, call_of
+from rps_jax.runs.question import OutputCommand, call_of
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.setting import Setting
@@ -43,7 +43,7 @@ _FPS = 12  # frames per second
 
 
 @dataclass(frozen=True)
-class Film(Command[Path]):
+class Film(OutputCommand[Path]):
     """Film many worlds of a sweep side by side."""
 
     run: str | Path = option("", positional=True)
@@ -109,8 +109,12 @@ class Film(Command[Path]):
 
     def execute(self, callback: ProgressCallback) -> Path:
         """Run the trials again and film them."""
+        out = Path(self.out or self.default_folder)
+        if self.conflict(out) and not self.overwrite:
+            rule = "choose another file, or replace it by --overwrite (in Python overwrite=True)"
+            raise InputError(f"out = {out} exists: {rule}.")
         takes, setting = self.takes()
-        seconds, out = self._length(setting), Path(self.out or self.default_folder)
+        seconds = self._length(setting)
         speed = self.speed or float(max(1, math.ceil(seconds / _LENGTH)))
         tiles = [map(take.tile, range(len(take.scenes))) for take in takes]
         frames = _frames(takes, setting, speed, seconds, callback)

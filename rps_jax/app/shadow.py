@@ -29,7 +29,7 @@ from rps_jax.record.options import option
 from rps_jax.robot import robot as robots
 from rps_jax.robot.robot import Robot, RobotLike
 from rps_jax.robot.skin import CapacitiveSkin, check_taxels, ends_of, with_contacts
-from rps_jax.runs.question import BagQuestion, Run, call_of
+from rps_jax.runs.question import BagQuestion, DefaultLaw, Run, call_of, suit_robot
 from rps_jax.tuning.logs import COLUMNS, motion_faults
 from rps_jax.world.tasks.path import PathCourse
 
@@ -43,7 +43,7 @@ class Shadow(BagQuestion[xr.Dataset]):
     file: str | Path = option("", positional=True)
     """Bag with what a robot observed, as `rps push --bag` or `ros2 bag record` writes it:
     FILE.mcap, FILE.db3 or a folder."""
-    law: LawLike = "rps_plus"
+    law: LawLike = DefaultLaw("rps_plus")
     """The law, by its name or its file, with changes, as rps_plus,mine.json."""
     robot: RobotLike = "ideal"
     """The robot of a bag that has taxels but no contacts: its name, or a JSON file of its size and
@@ -53,6 +53,10 @@ class Shadow(BagQuestion[xr.Dataset]):
     """Lookahead on the path of a bag that has no target [m]."""
 
     TITLE = "A law in the shadow of another"
+
+    def __post_init__(self) -> None:
+        """Set a law that suits the robot."""
+        suit_robot(self, self.robot)
 
     @property
     def params(self) -> LawParams:

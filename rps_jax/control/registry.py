@@ -32,14 +32,13 @@ from rps_jax.control.base import (
     named_leaves,
     thawing,
 )
-from rps_jax.control.laws import pose, unicycle
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import parse_changes
-from rps_jax.robot.robot import DriveKind, Robot
+from rps_jax.robot.robot import DriveKind
 from rps_jax.spec import Named
 
 T = TypeVar("T")  # a pytree
@@ -114,25 +113,6 @@ def law_of(params: LawParams | type) -> Law:
         fix = f"use {known}, or register the law with register_law"
         raise InputError(f"params of class {kind.__name__} belong to no law: {fix}.")
     return _LAWS_BY_CLASS[kind]
-
-
-def default_law(
-    robot: Robot, law: str = "rps", heading: bool = False, follows: bool = False
-) -> str:
-    """Return the name of a law for omnidirectional bases, or of one that suits the robot.
-
-    With a `heading`, it is a law for such goals, which also `follows` a path.
-
-    Raises:
-      InputError: no law of the package brings objects to a heading with this base.
-    """
-    if not heading:
-        return ({"omni": law} | unicycle.PRESET_OF)[robot.drive]
-    if (name := pose.preset_of(robot)) is None:
-        base = f"drive = {robot.drive}" if robot.radius is None else "a round base"
-        rule = f"no law for {base} brings objects to a heading; name one by law"
-        raise errors.not_allowed("law", "None", rule)
-    return f"path_{name}" if follows else name
 
 
 def laws_for(drive: DriveKind) -> list[str]:

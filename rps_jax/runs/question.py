@@ -54,6 +54,7 @@ from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike, parse_robot
 from rps_jax.runs.run import Run
+from rps_jax.trials.case import suited_laws
 from rps_jax.trials.progress import Bar, ProgressCallback, is_interactive
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
@@ -64,7 +65,7 @@ from rps_jax.world.domain import (
     task_attribute,
     task_in_words,
 )
-from rps_jax.world.tasks import TaskLike
+from rps_jax.world.tasks import Task, TaskLike
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -253,11 +254,29 @@ def _replace_field(record: D, name: str, value: object) -> D:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Question(Command[T]):
-    """Command with an answer, which is labelled data with a report."""
+class OutputCommand(Command[T]):
+    """Command whose output replaces no other one, unless the user asks for it."""
 
     overwrite: bool = False
-    """Whether a run that the folder already holds is removed first."""
+    """Whether an output that `out` already holds is removed first."""
+
+    def conflict(self, out: Path) -> object:
+        """Return something true if `out` holds another output, which this one would replace."""
+        return out.exists()
+
+    def in_free_place(self) -> Self:
+        """Return the command with the first of OUT, OUT-2, ... without another output."""
+        first = Path(str(self.out))
+        for count in itertools.count(1):
+            out = first if count == 1 else first.with_stem(f"{first.stem}-{count}")
+            if self.overwrite or not self.conflict(out):
+                return self if count == 1 else dataclasses.replace(self, out=out)
+        raise AssertionError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question(OutputCommand[T]):
+    """Command with an answer, which is labelled data with a report."""
 
     TITLE: ClassVar[str] = ""  # of the report
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("overwrite",)
@@ -327,14 +346,8 @@ class Question(Command[T]):
                 files.write_results(out / "results.nc", results)
             return answer
 
-    def in_free_folder(self) -> Self:
-        """Return the question with the first of the folders OUT, OUT-2, ... without another run."""
-        first, configuration = Path(str(self.out)), self.configuration()
-        for count in itertools.count(1):
-            out = first if count == 1 else first.with_name(f"{first.name}-{count}")
-            if self.overwrite or not folder.difference(out, configuration):
-                return self if count == 1 else dataclasses.replace(self, out=out)
-        raise AssertionError
+    def conflict(self, out: Path) -> object:
+        return folder.difference(out, self.configuration())
 
     def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
         """Return the run folder and the resources of the run."""
@@ -394,11 +407,29 @@ class TrialQuestion(QuickQuestion[T]):
         return Run(out, callback, self.slots, self.workers)
 
 
-def set_period(command: Any, robot: RobotLike | None) -> None:
-    """Set the control period of a robot in the setting of a command; `check` refuses others."""
-    if robot is not None and isinstance(command.setting, Setting):
-        setting = command.setting.with_robot(parse_robot(robot))
-        object.__setattr__(command, "setting", setting)
+class DefaultLaw(str):
+    """Law of a command that names none, unless robot and task need another one."""
+
+
+class DefaultLaws(tuple[str, ...]):
+    """Laws of a command that names none, unless robot and task need others."""
+
+
+def suit_robot(command: Any, robot: RobotLike | None, task: Task | None = None) -> None:
+    """Set what a command does not name: the robot's control period, and laws that suit it.
+
+    `check` refuses other periods.
+    """
+    if robot is None:
+        return
+    base = parse_robot(robot)
+    if isinstance(setting := getattr(command, "setting", None), Setting):
+        object.__setattr__(command, "setting", setting.with_robot(base))
+    law, laws = (vars(command).get(name) for name in ("law", "laws"))
+    if isinstance(law, DefaultLaw) and (suited := suited_laws(base, task, [law])) != (law,):
+        object.__setattr__(command, "law", suited[0])
+    if isinstance(laws, DefaultLaws) and (suited := suited_laws(base, task, laws)) != laws:
+        object.__setattr__(command, "laws", suited)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -408,12 +439,17 @@ class SimulationQuestion(TrialQuestion[T]):
     setting: Setting = Setting()
 
     def __post_init__(self) -> None:
-        """Set the control period of the robot."""
-        set_period(self, self._robot)
+        """Set the control period of the robot, and laws that suit it."""
+        suit_robot(self, *self._robot_and_task)
 
     @property
-    def _robot(self) -> RobotLike | None:
-        return getattr(self, "robot", None)
+    def _robot_and_task(self) -> tuple[RobotLike | None, Task | None]:
+        return getattr(self, "robot", None), None
+
+    def suited_laws(self, laws: Sequence[str]) -> Sequence[str]:
+        """Return those of some laws that suit robot and task, or another law that does."""
+        robot, task = self._robot_and_task
+        return laws if robot is None else suited_laws(parse_robot(robot), task, laws)
 
     def next_command(self, command: str, **values: object) -> str:
         """Return a command of the shell with values, and with robot, task and physics of this."""
@@ -431,9 +467,10 @@ class SimulationQuestion(TrialQuestion[T]):
 class LawQuestion(SimulationQuestion[T]):
     """Question about one law."""
 
-    law: LawLike = "rps_tuned"
+    law: LawLike = DefaultLaw("rps_tuned")
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
-    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
+    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json. Without it, another law than the
+    default is chosen if robot or goal need one."""
 
     @functools.cached_property
     def params(self) -> LawParams:
@@ -450,9 +487,10 @@ class LawQuestion(SimulationQuestion[T]):
 class MultiLawQuestion(SimulationQuestion[T]):
     """Question about several laws in the same worlds."""
 
-    laws: LawsLike = ("rps", "rps_tuned")
+    laws: LawsLike = DefaultLaws(("rps", "rps_tuned"))
     """The laws: names, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
-    policy.npz; changes follow each, as rps,K_h=0.3 or rps,tuned.json."""
+    policy.npz; changes follow each, as rps,K_h=0.3 or rps,tuned.json. Without it, other laws than
+    the default are chosen if robot or goal need them."""
 
     @functools.cached_property
     def chosen(self) -> dict[str, LawParams]:
@@ -472,12 +510,11 @@ class TaskOption:
     Changes follow, as corridor,width=1.2:1.6. By default the domain's, reach."""
 
     @property
-    def _robot(self) -> RobotLike:
-        if self.robot is not None:
-            return self.robot
+    def _robot_and_task(self) -> tuple[RobotLike, Task]:
         domain: Any = getattr(self, "domain", "wide")
-        several = isinstance(domain, tuple | list)
-        return domains.parse_domain(next(iter(domain), "wide") if several else domain).robot
+        first = next(iter(domain), "wide") if isinstance(domain, tuple | list) else domain
+        ranges = domains.parse_domain(first, self.robot, self.task)
+        return ranges.robot, ranges.task
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from rps_jax.runs import cluster, model_panel
 from rps_jax.runs.execution import run_missing, run_trials, write_dataset
 from rps_jax.runs.plan import Plan, Shard, attributes_of, load_plan, open_run, shard_chunks
 from rps_jax.runs.question import (
+    DefaultLaws,
     DomainQuestion,
     MultiLawQuestion,
     Question,
@@ -159,7 +160,7 @@ class Sweep(SweepOptions, PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQues
     TITLE = "Sweep over random worlds"
     QUICK: ClassVar = {"worlds": 64}
 
-    laws: LawsLike = ("rps", "nps", "aps")
+    laws: LawsLike = DefaultLaws(("rps", "nps", "aps"))
     worlds: int | None = option(None, 1, 1_000_000_000)
     """Number of worlds, of indices 0, 1, ...; by default 1000, or the whole grid of a domain with
     listed targets."""
@@ -264,7 +265,6 @@ class Merge(PlanQuestion):
 
     def answer(self, run: Run) -> xr.Dataset:
         first, *rest = folders = [Path(folder) for folder in self.folders]
-        out = run_folder.ensure_writable(Path(str(self.out)))
         manifest = run_folder.read_manifest(first)
         for folder in rest:
             if (shard := run_folder.read_manifest(folder)) != manifest:
@@ -274,10 +274,11 @@ class Merge(PlanQuestion):
                 )
         attrs = self.attributes() | attributes_of(self.plan)
         merged = Results(self.plan).read_all(folders).assign_attrs(attrs)
-        write_dataset(merged, open_run(out, self.plan))
-        for folder in folders:
-            provenance.write_environment(out, provenance.read_environment(folder))
-        return merged
+        environments = [*map(provenance.read_environment, folders)]
+        out = open_run(Path(str(self.out)), self.plan)
+        for environment in environments:
+            provenance.write_environment(out, environment)
+        return write_dataset(merged, out)
 
 
 merge = call_of(Merge)

@@ -21,7 +21,7 @@ from rps_jax.control.registry import LawLike
 from rps_jax.questions import LawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import SkinLike
-from rps_jax.runs.question import Rows
+from rps_jax.runs.question import DefaultLaw, Rows
 from rps_jax.studies.table import Table
 from rps_jax.trials import pushes
 from rps_jax.trials.progress import SequentialProgress
@@ -65,7 +65,7 @@ class Hardware(LawQuestion[xr.Dataset]):
     TITLE = "Hardware experiments"
     QUICK: ClassVar = {"shifts": (0.1, 0.2, 0.3)}
 
-    law: LawLike = "rps"
+    law: LawLike = DefaultLaw("rps")
     skin: SkinLike = "hardware"
     """The skin: ideal, thin, capacitive, or hardware, which has noise and unequal gains; changes
     follow, as capacitive,foam=0.01."""

@@ -24,7 +24,6 @@ from rps_jax.control.registry import LawLike
 from rps_jax.laws import LawParams, LawsLike, law_of, resolve_law
 from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.record.files import JsonObject
-from rps_jax.robot.robot import parse_robot
 from rps_jax.runs.question import Rows, TaskOption, count_true
 from rps_jax.runs.sweep import Sweep, SweepOptions, describe_plan
 from rps_jax.trials.progress import ProgressCallback, SequentialProgress
@@ -90,12 +89,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     def chosen(self) -> dict[str, LawParams]:
         if not isinstance(self.laws, tuple) or self.laws:
             return registry.resolve_laws(self.laws)
-        return registry.resolve_laws([x for x in all_laws() if x in self.laws_for_base])
-
-    @property
-    def laws_for_base(self) -> list[str]:
-        """Names of the laws whose twists the base can follow."""
-        return registry.laws_for(parse_robot(self._robot).drive)
+        return registry.resolve_laws(self.suited_laws(all_laws()))
 
     @cached_property
     def sweeps(self) -> dict[str, _TestSweep]:
@@ -213,9 +207,8 @@ class Score(Ladder, _ScoredLaw):
     def chosen(self) -> dict[str, LawParams]:
         label, params = resolve_law(self.law)
         scored = {label: registry.check_params(params)}
-        known = self.laws_for_base
-        default = ("rps", "rps_plus") if "rps" in known else known[:1]
-        return scored | registry.resolve_laws(self.laws or default) | scored
+        beside = self.laws or self.suited_laws(("rps", "rps_plus"))
+        return scored | registry.resolve_laws(beside) | scored
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
         sections = super().sections(sweep, results, run)

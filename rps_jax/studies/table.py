@@ -16,6 +16,7 @@ from rps_jax.laws import LawsLike
 from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of
 from rps_jax.record import files
 from rps_jax.runs.push import case_options
+from rps_jax.runs.question import DefaultLaws
 from rps_jax.trials import pushes
 from rps_jax.trials.case import FrictionLike, TrialOptions, label_of
 from rps_jax.trials.results import outcome_dataset
@@ -42,7 +43,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
     TITLE = "Table II: successes"
     QUICK: ClassVar = {"targets": paper.FEW_TARGETS}
 
-    laws: LawsLike = paper.LAWS
+    laws: LawsLike = DefaultLaws(paper.LAWS)
     objects: Annotated[Sequence[str], STORED] = PAPER_OBJECTS
     """Objects to push: their names, or custom MJCF files, FILE.xml, as of `rps push --object`."""
     friction: Sequence[FrictionLike] = ("S1", "S2")

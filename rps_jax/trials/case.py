@@ -1,11 +1,13 @@
 """Named cases: object, target, law, friction, skin and robot of one trial."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
+from rps_jax.control.laws import pose, unicycle
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import check_fields, option
 from rps_jax.robot import robot as robots
@@ -99,11 +101,7 @@ class Case(TrialOptions):
     @property
     def named_law(self) -> LawLike:
         """The law, or that for the robot's drive and the task if none is named."""
-        if self.law is not None:
-            return self.law
-        has_heading = heading_of(self.challenge) is not None
-        follows = not self.challenge.HAS_TARGET
-        return registry.default_law(self.base, heading=has_heading, follows=follows)
+        return suited_laws(self.base, self.challenge)[0] if self.law is None else self.law
 
     @cached_property
     def params(self) -> LawParams:
@@ -137,6 +135,24 @@ class Case(TrialOptions):
             f"{self.object_name.replace('_', ' ')}, friction ground {self.contact.ground:g}, "
             f"robot {self.contact.robot:g}"
         )
+
+
+def suited_laws(
+    robot: Robot, task: Task | None = None, laws: Sequence[str] = ("rps",)
+) -> tuple[str, ...]:
+    """Return those of some laws that suit a base and a task, or another law that does.
+
+    Raises:
+      InputError: no law of the package brings objects to a heading with this base.
+    """
+    if task is None or heading_of(task) is None:
+        known = registry.laws_for(robot.drive)
+        return tuple(x for x in laws if x in known) or (unicycle.PRESET_OF[robot.drive],)
+    if (name := pose.preset_of(robot)) is None:
+        base = f"drive = {robot.drive}" if robot.radius is None else "a round base"
+        rule = f"no law for {base} brings objects to a heading; name one by law"
+        raise errors.not_allowed("law", "None", rule)
+    return (name if task.HAS_TARGET else f"path_{name}",)
 
 
 def friction_of(friction: FrictionLike) -> Friction:

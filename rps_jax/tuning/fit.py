@@ -43,6 +43,7 @@ from rps_jax.record.options import option
 from rps_jax.runs.push import Trace, recorded_law
 from rps_jax.runs.question import (
     BagQuestion,
+    DefaultLaw,
     DomainQuestion,
     LawQuestion,
     Rows,
@@ -137,7 +138,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     # The values of the logs matter.
     IGNORED_FIELDS = ("logs", "topics")
 
-    law: LawLike = "rps"
+    law: LawLike = DefaultLaw("rps")
     worlds: int = option(6144, 96, 1_000_000)
     """Number of worlds of the domain that are simulated."""
     window: float = option(30.0, 5, 300, unit="s")

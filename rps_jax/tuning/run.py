@@ -31,7 +31,7 @@ from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import LawQuestion, Run, TaskOption, count_true
+from rps_jax.runs.question import DefaultLaw, LawQuestion, Run, TaskOption, count_true
 from rps_jax.spec import Spec
 from rps_jax.trials.progress import Bar, Progress, Timing
 from rps_jax.trials.score import Objective
@@ -87,7 +87,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         ("objective.risk", "objective.tail"), "tuners minimise the mean over all worlds"
     )
 
-    law: LawLike = "rps"
+    law: LawLike = DefaultLaw("rps")
     """Law with the initial parameters: a name, as rps, rps_tuned or rps_plus, or a file's class
     with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
     domain: Domains = ("wide",)

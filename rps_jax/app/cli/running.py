@@ -133,7 +133,7 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
     from rps_jax.engines import device
     from rps_jax.record import cache
     from rps_jax.runs.push import Trace
-    from rps_jax.runs.question import Question
+    from rps_jax.runs.question import OutputCommand, Question
     from rps_jax.world import opengl
 
     is_default = command.out == type(command)().out
@@ -149,10 +149,11 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
         jax.config.update("jax_platforms", "cpu")
     command = command.with_faults(faults)
     command.validate()
-    if is_default and isinstance(command, Question):
-        default, command = command.out, command.in_free_folder()
+    if is_default and isinstance(command, OutputCommand):
+        default, command = command.out, command.in_free_place()
         if command.out != default:
-            print(f"{default} holds another run: the folder of this one is {command.out}.")
+            kind = "the folder of this one" if isinstance(command, Question) else "this one"
+            print(f"{default} holds another run: {kind} is {command.out}.")
     _raise_interrupts()
     if note := command.note():
         print(note)
@@ -185,7 +186,7 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
     if getattr(command, "film", False) and (out / "worlds").is_dir():
         from rps_jax.app.film import Film
 
-        print(f"film: {Film(out / 'worlds', grid='3x4', which='hardest')()}")
+        print(f"film: {Film(out / 'worlds', grid='3x4', which='hardest', overwrite=True)()}")
     print(f"run folder: {out}")
 
 
@@ -200,12 +201,18 @@ def _report(question: Question[object], results: object, bar: Bar, film: list[Se
     """Write the report of the results, with the section of a film, and return its path."""
     while _importers:  # a module that two threads import at once may be incomplete in one
         _importers.pop().join()
-    from rps_jax.analysis.report import write_report
+    import xarray as xr
+
+    from rps_jax.analysis import tables
+    from rps_jax.analysis.report import Section, write_report
     from rps_jax.record import provenance
 
     out = Path(str(question.out))
     bar.phase("report")
     sections = [*question.report(results, question.create_run(out, bar)), *film]
+    if isinstance(results, xr.Dataset | xr.DataTree) and len(rows := tables.nan_table(results)) > 1:
+        text = "These laws returned NaN or infinity, and the trials ended there as diverged."
+        sections.insert(0, Section("Laws that returned NaN", text, rows))
     intro = [question.quick_note(), question.intro(results)]
     with contextlib.suppress(InputError):
         intro.append(provenance.describe(out))
