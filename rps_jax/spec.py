@@ -84,10 +84,10 @@ class Spec:
 
     unit: str = ""  # as m/s^2; of numbers of several units, as m, m, rad
     about: str = ""  # meaning, as in "width of the corridor"
-    _: dataclasses.KW_ONLY
     ge: float | None = None  # greater than or equal to
+    le: float | None = None  # less than or equal to
+    _: dataclasses.KW_ONLY
     gt: float | None = None
-    le: float | None = None
     lt: float | None = None
     log: bool = False  # whether the scale is logarithmic
     tune: Bound | None = None  # interval of tuners; None: not tuned
@@ -148,6 +148,15 @@ class Spec:
         """Return unit and meaning, as a comment at the field."""
         unit = f"[{self.unit}]" if self.unit else ""
         return self.about if unit in self.about else f"{unit} {self.about}"
+
+
+def tunable(
+    unit: str, about: str, low: float, high: float, *, log: bool = False, **limits: float | None
+) -> Spec:
+    """Declare a parameter, by default not negative, and the interval in which it is tuned."""
+    return Spec(
+        unit, about, tune=Bound(low, high, log), **{"ge": None if "gt" in limits else 0, **limits}
+    )
 
 
 @dataclass(frozen=True)

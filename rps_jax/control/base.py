@@ -59,7 +59,7 @@ class Smoothing(Protocol):
 # Parameters of several laws.
 SpeedMax = Annotated[Parameter, Spec("m/s", "bound on the speed", gt=0)]
 OmegaMax = Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)]
-ApproachSpeed = Annotated[Parameter, Spec("m/s", "forward speed before the first contact", ge=0)]
+ApproachSpeed = Annotated[Parameter, Spec("m/s", "forward speed before the first contact", 0)]
 SuccessDistance = Annotated[Parameter, Spec("m", "target reached", gt=0)]
 
 T = TypeVar("T")

@@ -47,16 +47,16 @@ class Odometry(NamedTuple):
     remembered steps, more than the longest latency or delay; with K = 0 the base is perfect.
     """
 
-    pose_noise: Annotated[
-        Number, Spec("m", "standard deviation of each position reading", ge=0)
-    ] = 0.0  # ()
-    yaw_noise: Annotated[
-        Number, Spec("rad", "standard deviation of each heading reading", ge=0)
-    ] = 0.0  # ()
-    pose_latency: Annotated[Number, Spec("s", "age of the pose that the law observes", ge=0)] = 0.0
-    command_delay: Annotated[
-        Number, Spec("s", "time between a command and its execution", ge=0)
-    ] = 0.0  # ()
+    pose_noise: Annotated[Number, Spec("m", "standard deviation of each position reading", 0)] = (
+        0.0  # ()
+    )
+    yaw_noise: Annotated[Number, Spec("rad", "standard deviation of each heading reading", 0)] = (
+        0.0  # ()
+    )
+    pose_latency: Annotated[Number, Spec("s", "age of the pose that the law observes", 0)] = 0.0
+    command_delay: Annotated[Number, Spec("s", "time between a command and its execution", 0)] = (
+        0.0  # ()
+    )
     velocity_error: Annotated[
         Number, Spec("1", "error of each component of the twist, or of two wheels")
     ] = 0.0  # (3,)
@@ -107,13 +107,13 @@ class LoadCell(NamedTuple):
     """A sensor of the planar force on the base; static, and so plain numbers."""
 
     noise: Annotated[
-        float, Spec("N", "standard deviation of each raw reading, of both components", ge=0)
+        float, Spec("N", "standard deviation of each raw reading, of both components", 0)
     ] = 1.0
     # From Heins and Schoellig (2024).
     time_constant: Annotated[float, Spec("s", "time constant of the low-pass filter", gt=0)] = 0.05
-    threshold: Annotated[
-        float, Spec("N", "filtered force below which the reading is zero", ge=0)
-    ] = 2.0
+    threshold: Annotated[float, Spec("N", "filtered force below which the reading is zero", 0)] = (
+        2.0
+    )
 
     def check(self) -> None:
         """Raise InputError for noise, filter or threshold that no sensor can have."""

@@ -48,68 +48,68 @@ class Robot:
     # Used if the force is limited.
     mass: Annotated[Number, Spec("kg", "mass of the whole robot", gt=0, le=1e4)] = 130.0  # ()
     # (2,): forward and sideways
-    v_max: Annotated[
-        Number, Spec("m/s", "greatest speed in any direction", ge=_POSITIVE, le=10)
-    ] = None  # () or (2,)
-    omega_max: Annotated[Number, Spec("rad/s", "greatest turning rate", ge=_POSITIVE, le=20)] = None
-    lag: Annotated[Number, Spec("s", "time constant with which it follows a twist", ge=0, le=5)] = (
+    v_max: Annotated[Number, Spec("m/s", "greatest speed in any direction", _POSITIVE, 10)] = (
+        None  # () or (2,)
+    )
+    omega_max: Annotated[Number, Spec("rad/s", "greatest turning rate", _POSITIVE, 20)] = None
+    lag: Annotated[Number, Spec("s", "time constant with which it follows a twist", 0, 5)] = (
         None  # ()
     )
     acceleration_max: Annotated[
-        Number, Spec("m/s^2, rad/s^2", "greatest accelerations", ge=_POSITIVE, le=100)
+        Number, Spec("m/s^2, rad/s^2", "greatest accelerations", _POSITIVE, 100)
     ] = None  # (2,)
     force_max: Annotated[
-        Number, Spec("N", "greatest force of the drive, in any direction", ge=0, le=1e5)
+        Number, Spec("N", "greatest force of the drive, in any direction", 0, 1e5)
     ] = None  # ()
     torque_max: Annotated[
-        Number, Spec("N m", "greatest torque about the vertical", ge=_POSITIVE, le=1e5)
+        Number, Spec("N m", "greatest torque about the vertical", _POSITIVE, 1e5)
     ] = None  # ()
     # Used if the force is limited.
     bandwidth: Annotated[
-        Number, Spec("Hz", "bandwidth of the drive's velocity servo", ge=0.1, le=100)
+        Number, Spec("Hz", "bandwidth of the drive's velocity servo", 0.1, 100)
     ] = 5.0  # ()
     # It bounds force and torque.
-    traction: Annotated[
-        Number, Spec("1", "friction coefficient of the wheels", ge=_POSITIVE, le=5)
-    ] = None  # ()
-    resistance: Annotated[Number, Spec("1", "rolling resistance over the weight", ge=0, le=1)] = (
+    traction: Annotated[Number, Spec("1", "friction coefficient of the wheels", _POSITIVE, 5)] = (
         None  # ()
     )
-    slip: Annotated[
-        Number, Spec("1", "share of the velocity that the wheels lose", ge=0, le=0.9)
-    ] = None  # ()
+    resistance: Annotated[Number, Spec("1", "rolling resistance over the weight", 0, 1)] = (
+        None  # ()
+    )
+    slip: Annotated[Number, Spec("1", "share of the velocity that the wheels lose", 0, 0.9)] = (
+        None  # ()
+    )
     # Rollers lose more of these; None: equal to `slip`.
-    slip_sideways: Annotated[Number, Spec("1", "share of v_y that is lost", ge=0, le=0.9)] = None
-    slip_yaw: Annotated[Number, Spec("1", "share of omega that is lost", ge=0, le=0.9)] = None
+    slip_sideways: Annotated[Number, Spec("1", "share of v_y that is lost", 0, 0.9)] = None
+    slip_yaw: Annotated[Number, Spec("1", "share of omega that is lost", 0, 0.9)] = None
     # In place of half length and half width; None: a rectangle.
-    radius: Annotated[Number, Spec("m", "radius of a round base", ge=0.1, le=2)] = None  # ()
+    radius: Annotated[Number, Spec("m", "radius of a round base", 0.1, 2)] = None  # ()
     drive: DriveKind = "omni"  # static
     # None: 0
     axle: Annotated[
-        Number, Spec("m", "wheels that cannot move sideways, behind the middle", ge=-2, le=2)
+        Number, Spec("m", "wheels that cannot move sideways, behind the middle", -2, 2)
     ] = None  # ()
     turning_radius: Annotated[
-        Number, Spec("m", "least turning radius of a car's axle", ge=_POSITIVE, le=20)
+        Number, Spec("m", "least turning radius of a car's axle", _POSITIVE, 20)
     ] = None  # ()
     # None: the width of the base.
     track: Annotated[Number, Spec("m", "distance between left and right wheel", gt=0, le=4)] = (
         None  # ()
     )
     wheel_speed_max: Annotated[
-        Number, Spec("m/s", "greatest speed of a wheel's rim", ge=_POSITIVE, le=20)
+        Number, Spec("m/s", "greatest speed of a wheel's rim", _POSITIVE, 20)
     ] = None  # ()
     wheel_acceleration_max: Annotated[
-        Number, Spec("m/s^2", "greatest acceleration of a wheel's rim", ge=_POSITIVE, le=100)
+        Number, Spec("m/s^2", "greatest acceleration of a wheel's rim", _POSITIVE, 100)
     ] = None  # ()
     # Of software; None: those of the physics and of the domain.
     period: Annotated[Number, Spec("s", "control period", gt=0, le=1)] = None  # () static
-    pose_latency: Annotated[Number, Spec("s", "age of the pose that laws observe", ge=0, le=1)] = (
+    pose_latency: Annotated[Number, Spec("s", "age of the pose that laws observe", 0, 1)] = (
         None  # ()
     )
     command_delay: Annotated[
-        Number, Spec("s", "time between a command and its execution", ge=0, le=1)
+        Number, Spec("s", "time between a command and its execution", 0, 1)
     ] = None  # ()
-    time_constant: Annotated[Number, Spec("s", "time constant of the skin", ge=_POSITIVE, le=1)] = (
+    time_constant: Annotated[Number, Spec("s", "time constant of the skin", _POSITIVE, 1)] = (
         None  # ()
     )
 

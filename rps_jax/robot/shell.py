@@ -42,14 +42,14 @@ class Boards:
     """A row of equal boards on one side, end to end; each taxel is an electrode of a board."""
 
     side: Side
-    count: Annotated[int, Spec("1", "number of boards", ge=1, le=100)]
+    count: Annotated[int, Spec("1", "number of boards", 1, 100)]
     # None: the row covers the whole side.
-    pitch: Annotated[Number | None, Spec("m", "pitch of the taxels", ge=0.002, le=1)] = None  # ()
+    pitch: Annotated[Number | None, Spec("m", "pitch of the taxels", 0.002, 1)] = None  # ()
     # None: 0.
     middle: Annotated[
-        Number | None, Spec("m", "middle along the strip, from that of the side", ge=-4, le=4)
+        Number | None, Spec("m", "middle along the strip, from that of the side", -4, 4)
     ] = None  # ()
-    electrodes: Annotated[int, Spec("1", "number of electrodes of a board", ge=1, le=100)] = 3
+    electrodes: Annotated[int, Spec("1", "number of electrodes of a board", 1, 100)] = 3
 
     @property
     def taxels(self) -> int:
@@ -77,14 +77,14 @@ class Row(NamedTuple):
 class Shell:
     """Outline of a base about its origin, and its boards in the strip's order."""
 
-    half_length: Annotated[Number, Spec("m", "half length of the base", ge=0.1, le=2)] = HALF_LENGTH
+    half_length: Annotated[Number, Spec("m", "half length of the base", 0.1, 2)] = HALF_LENGTH
     # None: the paper's, constant in compiled programs.
-    half_width: Annotated[Number | None, Spec("m", "half width", ge=0.1, le=2)] = None  # ()
+    half_width: Annotated[Number | None, Spec("m", "half width", 0.1, 2)] = None  # ()
     boards: tuple[Boards, ...] = BOARDS
     # Sample points of each taxel for the compression of foam; 1 cm apart they resolve a corner.
     samples: int = field(default=5, metadata={"static": True})
     # Its half sizes are unused then; None: a rectangle.
-    radius: Annotated[Number | None, Spec("m", "radius of a round base", ge=0.1, le=2)] = None  # ()
+    radius: Annotated[Number | None, Spec("m", "radius of a round base", 0.1, 2)] = None  # ()
 
     @classmethod
     def of(cls, boards: tuple[Boards, ...], *sizes: Number) -> Shell:

@@ -84,9 +84,9 @@ class IdealSkin(NamedTuple):
     chatters.
     """
 
-    tolerance: Annotated[Parameter, Spec("m", "gap that counts as contact", ge=0, le=0.1)] = 0.006
+    tolerance: Annotated[Parameter, Spec("m", "gap that counts as contact", 0, 0.1)] = 0.006
     # One taxel.
-    point_length: Annotated[Parameter, Spec("m", "longest POINT contact", ge=0, le=0.1)] = (
+    point_length: Annotated[Parameter, Spec("m", "longest POINT contact", 0, 0.1)] = (
         2 * HALF_WIDTH / 12
     )
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
@@ -154,16 +154,14 @@ class CapacitiveSkin(NamedTuple):
     time_constant: Annotated[Parameter, Spec("s", "time constant of the low-pass filter", gt=0)] = (
         0.05
     )
-    threshold: Annotated[
-        Parameter, Spec("1", "relative change of capacitance at contact", ge=0)
-    ] = 0.25
-    noise: Annotated[Parameter, Spec("1", "standard deviation of each raw reading", ge=0)] = 0.0
-    gain_spread: Annotated[
-        Parameter, Spec("1", "standard deviation of the taxels' gains about 1", ge=0)
-    ] = 0.0
-    dead_share: Annotated[Parameter, Spec("1", "probability that a taxel is dead", ge=0, le=1)] = (
-        0.0
+    threshold: Annotated[Parameter, Spec("1", "relative change of capacitance at contact", 0)] = (
+        0.25
     )
+    noise: Annotated[Parameter, Spec("1", "standard deviation of each raw reading", 0)] = 0.0
+    gain_spread: Annotated[
+        Parameter, Spec("1", "standard deviation of the taxels' gains about 1", 0)
+    ] = 0.0
+    dead_share: Annotated[Parameter, Spec("1", "probability that a taxel is dead", 0, 1)] = 0.0
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
     temperature: Annotated[
         Parameter | None, Spec("1", "width of the smooth threshold", gt=0, le=1)

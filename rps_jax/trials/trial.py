@@ -69,7 +69,7 @@ class Rules(NamedTuple):
         Spec(
             "s",
             "Time without contact, in all after the first touch, after which it has failed [s].",
-            ge=0,
+            0,
         ),
     ] = 150.0
     max_tilt: Annotated[

@@ -74,107 +74,93 @@ class Domain:
 
     # The object: a scene of `mjcf/`, a custom one by name or FILE.xml, or a random one of a family.
     objects: tuple[str, ...] = ("random_box", "random_cylinder", "random_prism")
-    mass: Annotated[Range, Quantity("kg", "mass of the object", ge=0.1, le=1e3)] = Range(
-        3, 60, log=True
-    )
+    mass: Annotated[Range, Quantity("kg", "mass of the object", 0.1, 1e3)] = Range(3, 60, log=True)
     # Half width: the square root of half depth times half breadth.
-    size: Annotated[Range, Quantity("m", "half width of the object", ge=0.03, le=1)] = Range(
-        0.1, 0.35
+    size: Annotated[Range, Quantity("m", "half width of the object", 0.03, 1)] = Range(0.1, 0.35)
+    aspect: Annotated[Range, Quantity("1", "breadth over depth", 0.1, 10, reported=False)] = Range(
+        0.5, 2.0, log=True
     )
-    aspect: Annotated[Range, Quantity("1", "breadth over depth", ge=0.1, le=10, reported=False)] = (
-        Range(0.5, 2.0, log=True)
-    )
-    height: Annotated[Range, Quantity("m", "height of the object", ge=0.1, le=2)] = Range(0.3, 0.8)
+    height: Annotated[Range, Quantity("m", "height of the object", 0.1, 2)] = Range(0.3, 0.8)
     # As a share of the way from the middle to the outline.
-    com_offset: Annotated[Range, Quantity("1", "centre of mass off the middle", ge=0, le=0.75)] = (
-        Range(0, 0.4)
+    com_offset: Annotated[Range, Quantity("1", "centre of mass off the middle", 0, 0.75)] = Range(
+        0, 0.4
     )
     # Of the load that moves the centre of mass: a copy of the object, of equal height, with an
     # outline of this share of its width that touches the object's from inside. The rest is uniform.
-    load_size: Annotated[Range, Quantity("1", "size of the load", ge=0.01, le=0.9)] = Range(
-        0.1, 0.25
-    )
+    load_size: Annotated[Range, Quantity("1", "size of the load", 0.01, 0.9)] = Range(0.1, 0.25)
     # Three or four feet, at this share of the way from the centre of mass to the outline; None: it
     # stands on its corners or its rim.
-    feet: Annotated[
-        Range | None, Quantity("1", "feet, of the way to the outline", ge=0.1, le=1)
-    ] = None
+    feet: Annotated[Range | None, Quantity("1", "feet, of the way to the outline", 0.1, 1)] = None
     # Pressure under objects without feet: 0 even, 1 along the rim, 2 at the corners, or between
     # for mixtures; also by name, as support=even. None: that of the physics.
-    support: Annotated[
-        Range | None, Quantity("1", "pressure: even, rim or corners", ge=0, le=2)
-    ] = None
-    friction_ground: Annotated[
-        Range, Quantity("1", "friction object-ground", ge=_POSITIVE, le=10)
-    ] = Range(0.1, 0.7)
-    friction_robot: Annotated[
-        Range, Quantity("1", "friction object-robot", ge=_POSITIVE, le=10)
-    ] = Range(0.1, 0.8)
+    support: Annotated[Range | None, Quantity("1", "pressure: even, rim or corners", 0, 2)] = None
+    friction_ground: Annotated[Range, Quantity("1", "friction object-ground", _POSITIVE, 10)] = (
+        Range(0.1, 0.7)
+    )
+    friction_robot: Annotated[Range, Quantity("1", "friction object-robot", _POSITIVE, 10)] = Range(
+        0.1, 0.8
+    )
     frictions: tuple[Friction, ...] = ()
     # The floor; None: level and uniform. It falls in a direction of the world (None: in any).
     slope: Annotated[
-        Range | None, Quantity("rad", "slope of the floor", ge=0, le=0.105, owner="floor")
+        Range | None, Quantity("rad", "slope of the floor", 0, 0.105, owner="floor")
     ] = None
     slope_bearing: Annotated[
-        Range | None, Quantity("rad", "downhill bearing", ge=-math.pi, le=math.pi, owner="floor")
+        Range | None, Quantity("rad", "downhill bearing", -math.pi, math.pi, owner="floor")
     ] = None
     # Factor of the object's friction with the ground beyond a line. The line is at right angles to
     # the direction from the base to the end of the trial, at this share of it (None: at any).
     boundary_factor: Annotated[
         Range | None,
-        Quantity("1", "factor of friction at the boundary", ge=0.05, le=20, owner="floor"),
+        Quantity("1", "factor of friction at the boundary", 0.05, 20, owner="floor"),
     ] = None
     boundary: Annotated[
-        Range | None, Quantity("1", "boundary, of the way", ge=0, le=1, owner="floor", jumps=True)
+        Range | None, Quantity("1", "boundary, of the way", 0, 1, owner="floor", jumps=True)
     ] = None
     # The task: object and target at the start, in the frame of the base.
-    lateral: Annotated[Range, Quantity("m", "lateral offset", ge=-0.5, le=0.5, owner="task")] = (
-        Range(-0.12, 0.12)
+    lateral: Annotated[Range, Quantity("m", "lateral offset", -0.5, 0.5, owner="task")] = Range(
+        -0.12, 0.12
     )
-    yaw: Annotated[
-        Range, Quantity("rad", "yaw of the object", ge=-math.pi, le=math.pi, owner="task")
-    ] = Range(-0.6, 0.6)
-    gap: Annotated[Range, Quantity("m", "gap at the start", ge=0, le=1, owner="task")] = Range(
-        0, 0.05
+    yaw: Annotated[Range, Quantity("rad", "yaw of the object", -math.pi, math.pi, owner="task")] = (
+        Range(-0.6, 0.6)
     )
-    distance: Annotated[
-        Range, Quantity("m", "distance of the target", ge=0.7, le=20, owner="task")
-    ] = Range(1, 3)
+    gap: Annotated[Range, Quantity("m", "gap at the start", 0, 1, owner="task")] = Range(0, 0.05)
+    distance: Annotated[Range, Quantity("m", "distance of the target", 0.7, 20, owner="task")] = (
+        Range(1, 3)
+    )
     bearing: Annotated[
-        Range, Quantity("rad", "bearing of the target", ge=-math.pi, le=math.pi, owner="task")
+        Range, Quantity("rad", "bearing of the target", -math.pi, math.pi, owner="task")
     ] = Range(-math.pi, math.pi)
     targets: tuple[tuple[float, float], ...] = ()  # [m]
     # The skin: ideal, or 42 capacitive taxels with these imperfections.
     skin: str = "capacitive"
     # Of each raw reading, as a change of capacitance.
-    noise: Annotated[Range, Quantity("1", "noise of the skin", ge=0, le=1, owner="skin")] = Range(
-        0, 0.05
-    )
+    noise: Annotated[Range, Quantity("1", "noise of the skin", 0, 1, owner="skin")] = Range(0, 0.05)
     gain_spread: Annotated[
-        Range, Quantity("1", "spread of the taxels' gains", ge=0, le=1, owner="skin")
+        Range, Quantity("1", "spread of the taxels' gains", 0, 1, owner="skin")
     ] = Range(0, 0.1)
-    dead_share: Annotated[
-        Range, Quantity("1", "dead taxels", ge=0, le=1, owner="skin", jumps=True)
-    ] = Range(0, 0.05)
+    dead_share: Annotated[Range, Quantity("1", "dead taxels", 0, 1, owner="skin", jumps=True)] = (
+        Range(0, 0.05)
+    )
     # None: the skin's default.
-    foam: Annotated[
-        Range | None, Quantity("m", "foam of the skin", ge=0.002, le=0.05, owner="skin")
-    ] = None
+    foam: Annotated[Range | None, Quantity("m", "foam of the skin", 0.002, 0.05, owner="skin")] = (
+        None
+    )
     time_constant: Annotated[
-        Range | None, Quantity("s", "time constant of the skin", ge=_POSITIVE, le=1, owner="skin")
+        Range | None, Quantity("s", "time constant of the skin", _POSITIVE, 1, owner="skin")
     ] = None
     # The base: errors of its odometry and of the executed twist.
-    pose_noise: Annotated[
-        Range, Quantity("m", "noise of the position", ge=0, le=1, owner="base")
-    ] = Range(0, 0.005)
-    yaw_noise: Annotated[
-        Range, Quantity("rad", "noise of the heading", ge=0, le=1, owner="base")
-    ] = Range(0, 0.01)
+    pose_noise: Annotated[Range, Quantity("m", "noise of the position", 0, 1, owner="base")] = (
+        Range(0, 0.005)
+    )
+    yaw_noise: Annotated[Range, Quantity("rad", "noise of the heading", 0, 1, owner="base")] = (
+        Range(0, 0.01)
+    )
     pose_latency: Annotated[
-        Range, Quantity("s", "latency of the pose", ge=0, le=1, owner="base", jumps=True)
+        Range, Quantity("s", "latency of the pose", 0, 1, owner="base", jumps=True)
     ] = Range(0, 0.1)
     command_delay: Annotated[
-        Range, Quantity("s", "delay of the command", ge=0, le=1, owner="base", jumps=True)
+        Range, Quantity("s", "delay of the command", 0, 1, owner="base", jumps=True)
     ] = Range(0, 0.1)
     # Of each component of the command, constant in a trial and of either sign. The robot's limits
     # bound the wrong command; wheels lose their slip after the limits.
@@ -183,8 +169,8 @@ class Domain:
         Quantity(
             "1",
             "error of the velocity",
-            ge=-0.9,
-            le=0.9,
+            -0.9,
+            0.9,
             owner="base",
             numbers=tuple(VELOCITY_ERRORS),
             reported=False,
@@ -193,30 +179,28 @@ class Domain:
     # The robot and its drawn limits; None: the robot's own value.
     robot: Robot = Robot()
     robot_force: Annotated[
-        Range | None, Quantity("N", "greatest force of the robot", ge=1, le=1e5, owner="robot")
+        Range | None, Quantity("N", "greatest force of the robot", 1, 1e5, owner="robot")
     ] = None
     robot_traction: Annotated[
         Range | None,
-        Quantity("1", "traction of the robot's wheels", ge=_POSITIVE, le=5, owner="robot"),
+        Quantity("1", "traction of the robot's wheels", _POSITIVE, 5, owner="robot"),
     ] = None
-    robot_lag: Annotated[
-        Range | None, Quantity("s", "lag of the robot", ge=0, le=5, owner="robot")
-    ] = None
+    robot_lag: Annotated[Range | None, Quantity("s", "lag of the robot", 0, 5, owner="robot")] = (
+        None
+    )
     # Also of the wheels when turning.
     robot_acceleration: Annotated[
         Range | None,
-        Quantity(
-            "m/s^2", "greatest acceleration of the robot", ge=_POSITIVE, le=100, owner="robot"
-        ),
+        Quantity("m/s^2", "greatest acceleration of the robot", _POSITIVE, 100, owner="robot"),
     ] = None
     robot_slip: Annotated[
-        Range | None, Quantity("1", "slip of the wheels", ge=0, le=0.9, owner="robot")
+        Range | None, Quantity("1", "slip of the wheels", 0, 0.9, owner="robot")
     ] = None
     robot_slip_sideways: Annotated[
-        Range | None, Quantity("1", "slip of the wheels sideways", ge=0, le=0.9, owner="robot")
+        Range | None, Quantity("1", "slip of the wheels sideways", 0, 0.9, owner="robot")
     ] = None
     robot_slip_yaw: Annotated[
-        Range | None, Quantity("1", "slip of the wheels when turning", ge=0, le=0.9, owner="robot")
+        Range | None, Quantity("1", "slip of the wheels when turning", 0, 0.9, owner="robot")
     ] = None
     # What is asked of the law; the ranges of a path are the task's own.
     task: Task = Reach()

@@ -34,31 +34,31 @@ from rps_jax.spec import Spec, document
 class APSParams(NamedTuple):
     """Parameters of APS; those marked (ours) are ours, since the publication does not give them."""
 
-    K1: Annotated[Parameter, Spec("1", "gain of the mean motion error", ge=0)] = 0.05
-    K2: Annotated[Parameter, Spec("1", "gain of the motion error", ge=0)] = 0.1
-    K_p: Annotated[Parameter, Spec("1/s", "heading gain", ge=0)] = 0.6
-    K_d: Annotated[Parameter, Spec("1", "heading rate gain", ge=0)] = 0.4
+    K1: Annotated[Parameter, Spec("1", "gain of the mean motion error", 0)] = 0.05
+    K2: Annotated[Parameter, Spec("1", "gain of the motion error", 0)] = 0.1
+    K_p: Annotated[Parameter, Spec("1/s", "heading gain", 0)] = 0.6
+    K_d: Annotated[Parameter, Spec("1", "heading rate gain", 0)] = 0.4
     yaw_error_max: Annotated[
-        Parameter, Spec("rad", "heading error above which the robot turns in place", ge=0)
+        Parameter, Spec("rad", "heading error above which the robot turns in place", 0)
     ] = 0.3
-    margin: Annotated[
-        Parameter, Spec("m", "gap above which the robot approaches straight", ge=0)
-    ] = 0.10
+    margin: Annotated[Parameter, Spec("m", "gap above which the robot approaches straight", 0)] = (
+        0.10
+    )
     r_robot: Annotated[
-        Parameter, Spec("m", "equivalent radius of a rectangular base (ours)", ge=0)
+        Parameter, Spec("m", "equivalent radius of a rectangular base (ours)", 0)
     ] = HALF_LENGTH
     gamma_drop: Annotated[
-        Parameter, Spec("rad", "decrease of |gamma| after which alpha is good", ge=0)
+        Parameter, Spec("rad", "decrease of |gamma| after which alpha is good", 0)
     ] = 0.01
-    alpha_mean: Annotated[Parameter, Spec("rad", "prior mean of good alphas", ge=0)] = jnp.pi
+    alpha_mean: Annotated[Parameter, Spec("rad", "prior mean of good alphas", 0)] = jnp.pi
     alpha_variance: Annotated[Parameter, Spec("rad^2", "prior variance", gt=0)] = jnp.pi / 4
     alpha_count: Annotated[Parameter, Spec("1", "weight of the prior", gt=0)] = 100.0
     aim_beyond: Annotated[
-        Parameter, Spec("1", "object radii beyond the target (ours); 0: as published", ge=0)
+        Parameter, Spec("1", "object radii beyond the target (ours); 0: as published", 0)
     ] = 1.0
-    min_motion: Annotated[Parameter, Spec("m", "least motion of the object (ours)", ge=0)] = 0.001
+    min_motion: Annotated[Parameter, Spec("m", "least motion of the object (ours)", 0)] = 0.001
     v_max: SpeedMax = 0.05
-    v_min: Annotated[Parameter, Spec("m/s", "least speed (ours)", ge=0)] = 0.01
+    v_min: Annotated[Parameter, Spec("m/s", "least speed (ours)", 0)] = 0.01
     omega_max: OmegaMax = 0.15
     d_success: SuccessDistance = 0.05
 

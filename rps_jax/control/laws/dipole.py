@@ -24,7 +24,7 @@ from rps_jax.control.base import Law, OmegaMax, SuccessDistance, bounds_of
 from rps_jax.control.observation import Details, PoseObservation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter
-from rps_jax.spec import Bound, Spec, document
+from rps_jax.spec import Spec, document, tunable
 
 
 @document
@@ -33,16 +33,14 @@ class DipoleParams(NamedTuple):
 
     K_h: Annotated[
         Parameter,
-        Spec("1/s", "turning rate over heading error", gt=0, tune=Bound(0.02, 5, log=True)),
+        tunable("1/s", "turning rate over heading error", 0.02, 5, log=True, gt=0),
     ] = 1.0
     lookahead: Annotated[
         Parameter,
-        Spec(
-            "m", "distance along the path from object to aim", gt=0, tune=Bound(0.05, 3, log=True)
-        ),
+        tunable("m", "distance along the path from object to aim", 0.05, 3, log=True, gt=0),
     ] = 1.0
     beyond: Annotated[
-        Parameter, Spec("1", "object radii after which a target is passed", ge=0, tune=Bound(0, 5))
+        Parameter, tunable("1", "object radii after which a target is passed", 0, 5)
     ] = 2.0
     v_max: Annotated[Parameter, Spec("m/s", "speed, the bound of RPS", gt=0)] = 0.05
     omega_max: OmegaMax = 0.15

@@ -34,15 +34,13 @@ from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SuccessDistance, 
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter, Pytree, Scalar
-from rps_jax.spec import Bound, Spec, document
+from rps_jax.spec import Spec, document, tunable
 
 # Parameters of both forms of Force Push.
 AngleGain = Annotated[
-    Parameter, Spec("1", "gain of the force's angle, beyond 1", tune=Bound(-2, 4))
+    Parameter, tunable("1", "gain of the force's angle, beyond 1", -2, 4, ge=None)
 ]
-HeadingGain = Annotated[
-    Parameter, Spec("1/s", "gain of the heading", ge=0, tune=Bound(0.005, 2, log=True))
-]
+HeadingGain = Annotated[Parameter, tunable("1/s", "gain of the heading", 0.005, 2, log=True)]
 ContactSpeed = Annotated[
     Parameter, Spec("m/s", "speed of the contact, and bound for the base", gt=0)
 ]
@@ -54,29 +52,21 @@ class ForcePushParams(NamedTuple):
     """Parameters of Force Push; the gains are those of its authors' experiments."""
 
     k_theta: AngleGain = 0.3
-    k_y: Annotated[Parameter, Spec("rad/m", "gain of the path", tune=Bound(-2, 2))] = 0.5
+    k_y: Annotated[Parameter, tunable("rad/m", "gain of the path", -2, 2, ge=None)] = 0.5
     k_omega: HeadingGain = 1.0
     converge: Annotated[
         Parameter,
-        Spec(
-            "rad",
-            "largest change of theta_p in a step without contact",
-            ge=0,
-            tune=Bound(0.001, 1, log=True),
-        ),
+        tunable("rad", "largest change of theta_p in a step without contact", 0.001, 1, log=True),
     ] = 0.1
     drift: Annotated[
         Parameter,
-        Spec(
-            "m",
-            "lambda, length of motion over which drift is estimated",
-            gt=0,
-            tune=Bound(0.01, 1, log=True),
+        tunable(
+            "m", "lambda, length of motion over which drift is estimated", 0.01, 1, log=True, gt=0
         ),
     ] = 0.1
     angle_max: Annotated[
         Parameter,
-        Spec("rad", "largest angle between push and heading", gt=0, tune=Bound(0.2, 1.57)),
+        tunable("rad", "largest angle between push and heading", 0.2, 1.57, gt=0),
     ] = 1.2
     v_max: ContactSpeed = 0.05
     omega_max: OmegaMax = 0.15

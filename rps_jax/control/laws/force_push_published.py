@@ -34,7 +34,7 @@ from rps_jax.control.laws.force_push import AngleGain, ContactSpeed, HeadingGain
 from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter
-from rps_jax.spec import Bound, Spec, document
+from rps_jax.spec import Spec, document, tunable
 
 
 @document
@@ -43,36 +43,24 @@ class PublishedForcePushParams(NamedTuple):
 
     k_theta: AngleGain = 0.3
     k_y: Annotated[
-        Parameter, Spec("rad/m", "gain of the path; 0.1 in their simulations", tune=Bound(-2, 2))
+        Parameter, tunable("rad/m", "gain of the path; 0.1 in their simulations", -2, 2, ge=None)
     ] = 0.5
     k_omega: HeadingGain = 1.0
     converge: Annotated[
         Parameter,
-        Spec(
-            "rad/s", "largest rate of theta_p without a force", ge=0, tune=Bound(0.1, 100, log=True)
-        ),
+        tunable("rad/s", "largest rate of theta_p without a force", 0.1, 100, log=True),
     ] = 10.0
     f_min: Annotated[
         Parameter,
-        Spec(
-            "N",
-            "least force of a contact; 5 N in their experiments",
-            ge=0,
-            tune=Bound(0.1, 20, log=True),
-        ),
+        tunable("N", "least force of a contact; 5 N in their experiments", 0.1, 20, log=True),
     ] = 1.0
     f_max: Annotated[
         Parameter,
-        Spec("N", "force above which the base yields", ge=0, tune=Bound(10, 1000, log=True)),
+        tunable("N", "force above which the base yields", 10, 1000, log=True),
     ] = 50.0
     k_f: Annotated[
         Parameter,
-        Spec(
-            "m/s/N",
-            "admittance; 0.003 at their speed of 0.1 m/s",
-            ge=0,
-            tune=Bound(1e-5, 0.02, log=True),
-        ),
+        tunable("m/s/N", "admittance; 0.003 at their speed of 0.1 m/s", 1e-5, 0.02, log=True),
     ] = 0.0015
     v_max: ContactSpeed = 0.05
     omega_max: OmegaMax = 0.15

@@ -42,7 +42,7 @@ class GuidedParams(NamedTuple):
         np.zeros((KNOTS, 3))
     )  # (J, 3)
     hold: Annotated[
-        Parameter, Spec("1", "control steps per offset: 5 s, so that 60 take 300 s", ge=1)
+        Parameter, Spec("1", "control steps per offset: 5 s, so that 60 take 300 s", 1)
     ] = 250
 
     @property

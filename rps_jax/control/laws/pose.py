@@ -54,7 +54,7 @@ is a weight that mixes the twists of Q6; modes and legs switch.
 """
 
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +76,7 @@ from rps_jax.control.observation import Details, EndsObservation, Observation, T
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry.arrays import Array, Parameter
 from rps_jax.robot.robot import Robot
-from rps_jax.spec import Bound, Spec, document
+from rps_jax.spec import Spec, document, tunable
 
 PUSH, BACK, AROUND = 0, 1, 2  # modes
 _EDGE = 0.05  # [m] of contact beyond a known end, which contradicts it
@@ -91,13 +91,6 @@ _AROUND, _CENTRAL = 0.08, 0.2  # [m] behind the front, and from its middle
 _TURNS = 0.8  # [rad] between base and leg, up to which it feels the box and turns while it touches
 
 
-def _tuned(
-    unit: str, about: str, low: float, high: float, *, log: bool = False, **limits: Any
-) -> Spec:
-    """Declare a parameter that is not negative, and the interval in which it is tuned."""
-    return Spec(unit, about, tune=Bound(low, high, log), **(limits or {"ge": 0}))
-
-
 @document
 class PoseParams(NamedTuple):
     """Parameters of the law."""
@@ -108,59 +101,61 @@ class PoseParams(NamedTuple):
     v_approach: ApproachSpeed = 0.03
     v_free: Annotated[Parameter, Spec("m/s", "bound on the speed without contact", gt=0)] = 0.05
     omega_free: Annotated[Parameter, Spec("rad/s", "bound on |omega| without contact", gt=0)] = 0.15
-    r: Annotated[Parameter, _tuned("m", "half width of an unknown object", 0.1, 0.4, gt=0)] = 0.2346
-    s_min: Annotated[Parameter, _tuned("m", "least way of the last leg, Q4", 0.1, 2)] = 1.381
-    s_flush: Annotated[Parameter, _tuned("m", "the same, once the box was flush, Q4", 0.02, 2)] = (
+    r: Annotated[Parameter, tunable("m", "half width of an unknown object", 0.1, 0.4, gt=0)] = (
+        0.2346
+    )
+    s_min: Annotated[Parameter, tunable("m", "least way of the last leg, Q4", 0.1, 2)] = 1.381
+    s_flush: Annotated[Parameter, tunable("m", "the same, once the box was flush, Q4", 0.02, 2)] = (
         1.187
     )
-    s_back: Annotated[Parameter, _tuned("m", "more way, Q5", 0, 0.5)] = 0.08447
-    y_tol: Annotated[Parameter, _tuned("m", "error of a last leg, Q4", 0, 0.1)] = 0.01493
-    cap: Annotated[Parameter, _tuned("1", "error that the last leg corrects, Q4", 0, 0.5)] = 0.05
-    y_miss: Annotated[Parameter, _tuned("m", "error of a last leg that is repeated", 0, 0.1)] = (
+    s_back: Annotated[Parameter, tunable("m", "more way, Q5", 0, 0.5)] = 0.08447
+    y_tol: Annotated[Parameter, tunable("m", "error of a last leg, Q4", 0, 0.1)] = 0.01493
+    cap: Annotated[Parameter, tunable("1", "error that the last leg corrects, Q4", 0, 0.5)] = 0.05
+    y_miss: Annotated[Parameter, tunable("m", "error of a last leg that is repeated", 0, 0.1)] = (
         0.025
     )
-    stop: Annotated[Parameter, Spec("m", "way left at the end, Q5", ge=-0.1)] = 0.004
-    tries: Annotated[Parameter, Spec("1", "number of repetitions", ge=0)] = 3.0
-    slope: Annotated[Parameter, _tuned("1", "sideways over forward speed, Q6", 0.02, 0.6)] = 0.2135
+    stop: Annotated[Parameter, Spec("m", "way left at the end, Q5", -0.1)] = 0.004
+    tries: Annotated[Parameter, Spec("1", "number of repetitions", 0)] = 3.0
+    slope: Annotated[Parameter, tunable("1", "sideways over forward speed, Q6", 0.02, 0.6)] = 0.2135
     K_y: Annotated[
         Parameter,
-        _tuned("1/s", "gain of the sideways speed, Q6", 0.02, 2, log=True),
+        tunable("1/s", "gain of the sideways speed, Q6", 0.02, 2, log=True),
     ] = 0.2
     K_h: Annotated[
         Parameter,
-        _tuned("rad/m", "gain of the heading, Q6 and Q10", 0.1, 6, log=True),
+        tunable("rad/m", "gain of the heading, Q6 and Q10", 0.1, 6, log=True),
     ] = 1.798
-    h_max: Annotated[Parameter, _tuned("rad", "bound of this heading", 0.01, 0.8)] = 0.7169
-    turn: Annotated[Parameter, _tuned("1", "share of the sharpest turn, Q10", 0.3, 1.2)] = 0.5994
+    h_max: Annotated[Parameter, tunable("rad", "bound of this heading", 0.01, 0.8)] = 0.7169
+    turn: Annotated[Parameter, tunable("1", "share of the sharpest turn, Q10", 0.3, 1.2)] = 0.5994
     reach: Annotated[
         Parameter,
-        _tuned("1", "share of a turn that the last leg may use, Q4", 0, 1.5),
+        tunable("1", "share of a turn that the last leg may use, Q4", 0, 1.5),
     ] = 0.7677
-    s_line: Annotated[Parameter, _tuned("m", "straight end of the last leg, Q4", 0, 0.8)] = 0.3371
+    s_line: Annotated[Parameter, tunable("m", "straight end of the last leg, Q4", 0, 0.8)] = 0.3371
     K_e: Annotated[
         Parameter,
-        _tuned("1/m", "curvature for an error of the heading, Q10", 1, 20, log=True),
+        tunable("1/m", "curvature for an error of the heading, Q10", 1, 20, log=True),
     ] = 9.391
     omega_push: Annotated[
         Parameter,
-        _tuned("rad/s", "bound on |omega| in contact", 0.005, 0.15, log=True, gt=0),
+        tunable("rad/s", "bound on |omega| in contact", 0.005, 0.15, log=True, gt=0),
     ] = 0.03
-    l_edge: Annotated[Parameter, _tuned("m", "offset of a bad contact, Q7", 0.05, 0.3)] = 0.1418
-    l_turn: Annotated[Parameter, _tuned("m", "the same, of an uneven contact, Q7", 0.1, 0.3)] = (
+    l_edge: Annotated[Parameter, tunable("m", "offset of a bad contact, Q7", 0.05, 0.3)] = 0.1418
+    l_turn: Annotated[Parameter, tunable("m", "the same, of an uneven contact, Q7", 0.1, 0.3)] = (
         0.2511
     )
-    back: Annotated[Parameter, _tuned("m", "retreat, Q7", 0.02, 0.6)] = 0.09401
+    back: Annotated[Parameter, tunable("m", "retreat, Q7", 0.02, 0.6)] = 0.09401
     R: Annotated[
-        Parameter, _tuned("m", "radius of the circle beyond the box, Q8", 0.4, 1, gt=0)
+        Parameter, tunable("m", "radius of the circle beyond the box, Q8", 0.4, 1, gt=0)
     ] = 0.5324
-    gap: Annotated[Parameter, _tuned("m", "gap at the staging point, Q8", 0.03, 0.6, gt=0)] = (
+    gap: Annotated[Parameter, tunable("m", "gap at the staging point, Q8", 0.03, 0.6, gt=0)] = (
         0.05946
     )
     beyond: Annotated[
-        Parameter, _tuned("m", "of the base beyond the felt end, Q9", -0.1, 0.2, ge=-0.2)
+        Parameter, tunable("m", "of the base beyond the felt end, Q9", -0.1, 0.2, ge=-0.2)
     ] = 0.02732
-    looks: Annotated[Parameter, Spec("1", "number of looks in a leg, Q9", ge=0)] = 3.0
-    tau: Annotated[Parameter, _tuned("s", "time constant of the filter of the pose", 0, 2)] = 0.5
+    looks: Annotated[Parameter, Spec("1", "number of looks in a leg, Q9", 0)] = 3.0
+    tau: Annotated[Parameter, tunable("s", "time constant of the filter of the pose", 0, 2)] = 0.5
     t_end: Annotated[Parameter, Spec("s", "time at which the law gives up", gt=0)] = 290.0
 
 

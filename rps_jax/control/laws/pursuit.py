@@ -17,26 +17,24 @@ from rps_jax.control.base import Law, OmegaMax, SpeedMax, SuccessDistance, bound
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter
-from rps_jax.spec import Bound, Spec, document
+from rps_jax.spec import Spec, document, tunable
 
 
 @document
 class PursuitParams(NamedTuple):
     """Parameters of pursuit; the bounds are those of RPS."""
 
-    K_v: Annotated[
-        Parameter, Spec("1/s", "speed over distance", gt=0, tune=Bound(0.02, 2, log=True))
-    ] = 0.5
+    K_v: Annotated[Parameter, tunable("1/s", "speed over distance", 0.02, 2, log=True, gt=0)] = 0.5
     K_h: Annotated[
         Parameter,
-        Spec("1/s", "turning rate over heading error", gt=0, tune=Bound(0.005, 2, log=True)),
+        tunable("1/s", "turning rate over heading error", 0.005, 2, log=True, gt=0),
     ] = 1.0
-    press: Annotated[
-        Parameter, Spec("1", "least share of the speed that is forward", ge=0, tune=Bound(0, 2))
-    ] = 0.2
+    press: Annotated[Parameter, tunable("1", "least share of the speed that is forward", 0, 2)] = (
+        0.2
+    )
     v_max: SpeedMax = 0.05
     omega_max: OmegaMax = 0.15
-    v_approach: Annotated[Parameter, Spec("m/s", "forward speed without contact", ge=0)] = 0.01
+    v_approach: Annotated[Parameter, Spec("m/s", "forward speed without contact", 0)] = 0.01
     d_success: SuccessDistance = 0.05
 
 

@@ -33,7 +33,7 @@ from rps_jax.control.base import Law, OmegaMax, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bools, Float, Floats, Parameter, PerWorld
-from rps_jax.spec import Bound, Spec, document
+from rps_jax.spec import Bound, Spec, document, tunable
 
 
 @document
@@ -45,44 +45,35 @@ class RPSParams(NamedTuple):
 
     eta: Annotated[
         Parameter,
-        Spec(
-            "1", "upper asymptote of the adaptive rate, Eq. 5", ge=0, tune=Bound(1, 100, log=True)
-        ),
+        tunable("1", "upper asymptote of the adaptive rate, Eq. 5", 1, 100, log=True),
     ] = 10.0
-    zeta: Annotated[Parameter, Spec("1", "lower asymptote, Eq. 5", tune=Bound(-2, 5))] = 0.0
-    beta: Annotated[
-        Parameter, Spec("m", "inflection point of |l|, Eq. 5", ge=0, tune=Bound(0.01, 0.3))
-    ] = 0.12
-    k: Annotated[Parameter, Spec("1/m", "steepness, Eq. 5", ge=0, tune=Bound(5, 500, log=True))] = (
-        60.0
-    )
-    K_h: Annotated[
-        Parameter, Spec("1", "heading gain, Eq. 7", gt=0, tune=Bound(0.1, 5, log=True))
-    ] = 1.0
-    K_v: Annotated[
-        Parameter, Spec("1/s", "velocity gain, Eq. 3", gt=0, tune=Bound(0.02, 2, log=True))
-    ] = 0.1
+    zeta: Annotated[Parameter, tunable("1", "lower asymptote, Eq. 5", -2, 5, ge=None)] = 0.0
+    beta: Annotated[Parameter, tunable("m", "inflection point of |l|, Eq. 5", 0.01, 0.3)] = 0.12
+    k: Annotated[Parameter, tunable("1/m", "steepness, Eq. 5", 5, 500, log=True)] = 60.0
+    K_h: Annotated[Parameter, tunable("1", "heading gain, Eq. 7", 0.1, 5, log=True, gt=0)] = 1.0
+    K_v: Annotated[Parameter, tunable("1/s", "velocity gain, Eq. 3", 0.02, 2, log=True, gt=0)] = 0.1
     L: Annotated[
-        Parameter, Spec("m", "turning length, Eqs. 6 and 9", gt=0, tune=Bound(0.03, 1.5, log=True))
+        Parameter, tunable("m", "turning length, Eqs. 6 and 9", 0.03, 1.5, log=True, gt=0)
     ] = 0.2
     l_cr: Annotated[
         Parameter,
-        Spec(
+        tunable(
             "m",
             "start of the critical region; the half width of the base is 0.29",
+            0.1,
+            0.289,
             gt=0,
-            tune=Bound(0.1, 0.289),
         ),
     ] = 0.24
     d_th: Annotated[
         Parameter,
-        Spec("m", "no lateral motion nearer than this, Eq. 5", ge=0, tune=Bound(0.02, 2, log=True)),
+        tunable("m", "no lateral motion nearer than this, Eq. 5", 0.02, 2, log=True),
     ] = 0.5
     v_max: Annotated[Parameter, Spec("m/s", "bound on the norm of (v_x, v_y)", gt=0)] = 0.05
     omega_max: OmegaMax = 0.15
     d_success: Annotated[Parameter, Spec("m", "target reached, Algorithm 1", gt=0)] = 0.05
     v_approach: Annotated[
-        Parameter, Spec("m/s", "forward speed without contact (Sec. III-B)", ge=0)
+        Parameter, Spec("m/s", "forward speed without contact (Sec. III-B)", 0)
     ] = 0.01
 
     l_mr: Annotated[
@@ -90,42 +81,38 @@ class RPSParams(NamedTuple):
         Spec(
             "m",
             "end of the middle region, where Realignment stops",
-            ge=0,
+            0,
             tune=Bound(0.02, 0.98, relative_to="l_cr"),
         ),
     ] = 0.15
     a_r_max: Annotated[
         Parameter,
-        Spec("1", "adaptive rate in Realignment; eta's value", ge=0, tune=Bound(1, 100, log=True)),
+        tunable("1", "adaptive rate in Realignment; eta's value", 1, 100, log=True),
     ] = 10.0
     gamma_max: Annotated[
         Parameter,
-        Spec(
-            "rad",
-            "bound on |gamma|; inf is the tangent as printed",
-            gt=0,
-            le=math.inf,
-            tune=Bound(0.5, 1.57),
+        tunable(
+            "rad", "bound on |gamma|; inf is the tangent as printed", 0.5, 1.57, gt=0, le=math.inf
         ),
     ] = 1.56
     v_lost: Annotated[
         Parameter,
-        Spec("m/s", "forward speed after contact is lost", ge=0, tune=Bound(0.001, 0.05, log=True)),
+        tunable("m/s", "forward speed after contact is lost", 0.001, 0.05, log=True),
     ] = 0.01
-    sgn_0: Annotated[Parameter, Spec("1", "sgn(0), from 0 to 1", ge=0, le=1)] = 0.0
+    sgn_0: Annotated[Parameter, Spec("1", "sgn(0), from 0 to 1", 0, 1)] = 0.0
 
     # Switches, each 0 or 1.
     reactive: Annotated[
-        Parameter, Spec("1", "1: RPS; 0: NPS (a_r = 0 and no Realignment)", ge=0, le=1)
+        Parameter, Spec("1", "1: RPS; 0: NPS (a_r = 0 and no Realignment)", 0, 1)
     ] = 1.0
     keep_contact: Annotated[
-        Parameter, Spec("1", "1: after a loss the last contact is used", ge=0, le=1)
+        Parameter, Spec("1", "1: after a loss the last contact is used", 0, 1)
     ] = 0.0
     saturate_first: Annotated[
-        Parameter, Spec("1", "1: omega from the saturated v_x; 0: the unsaturated", ge=0, le=1)
+        Parameter, Spec("1", "1: omega from the saturated v_x; 0: the unsaturated", 0, 1)
     ] = 1.0
     clip_each: Annotated[
-        Parameter, Spec("1", "1: v_x and v_y clipped one by one, not as a vector", ge=0, le=1)
+        Parameter, Spec("1", "1: v_x and v_y clipped one by one, not as a vector", 0, 1)
     ] = 0.0
 
     @classmethod

@@ -41,7 +41,7 @@ from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number, Parameter, Scalar
-from rps_jax.spec import Bound, Spec, document
+from rps_jax.spec import Spec, document, tunable
 
 FACING = 0.3  # [rad] P3's facing
 REACH = 0.45  # [m] P3's reach: the base's front is 0.36 m ahead of its centre
@@ -57,33 +57,21 @@ class RPSPlusParams(NamedTuple):
     law: RPSParams = RPSParams.tuned()._replace(v_approach=0.03)  # of Eqs. 1-10
     d_near: Annotated[
         Parameter,
-        Spec(
-            "m",
-            "distance within which the base translates, P1",
-            ge=0,
-            tune=Bound(0.05, 1, log=True),
-        ),
+        tunable("m", "distance within which the base translates, P1", 0.05, 1, log=True),
     ] = 0.25
     press: Annotated[
         Parameter,
-        Spec("1", "least share of the speed that is forward, P2", ge=0, le=1, tune=Bound(0, 1)),
+        tunable("1", "least share of the speed that is forward, P2", 0, 1, le=1),
     ] = 0.2
     n_lost: Annotated[
         Parameter,
-        Spec(
-            "1",
-            "control steps without contact before P3: 2 s",
-            ge=0,
-            tune=Bound(10, 2000, log=True),
-        ),
+        tunable("1", "control steps without contact before P3: 2 s", 10, 2000, log=True),
     ] = 100
     ahead: Annotated[
         Parameter,
-        Spec("1", "share of v_max towards the last contact, P3", ge=0, le=1, tune=Bound(0, 1)),
+        tunable("1", "share of v_max towards the last contact, P3", 0, 1, le=1),
     ] = 0.7
-    aside: Annotated[
-        Parameter, Spec("1", "share of v_max to the side, P3", ge=0, le=1, tune=Bound(0, 1))
-    ] = 0.5
+    aside: Annotated[Parameter, tunable("1", "share of v_max to the side, P3", 0, 1, le=1)] = 0.5
 
     @property
     def d_success(self) -> Number:

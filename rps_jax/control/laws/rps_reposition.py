@@ -27,7 +27,7 @@ from rps_jax.control.laws.rps_plus import RPSPlusParams, RPSPlusState
 from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number, Parameter
-from rps_jax.spec import Bound, Spec, document
+from rps_jax.spec import Spec, document, tunable
 
 _AHEAD = 1.26  # [rad] by which the base aims ahead on the circle
 _SEARCH_ANGLE = 0.5  # [rad] of the next guess of M beside the heading of an approach that missed
@@ -41,17 +41,15 @@ class RPSRepositionParams(NamedTuple):
     law: RPSPlusParams = RPSPlusParams()  # of RPS+
     t_stuck: Annotated[
         Parameter,
-        Spec("s", "without progress until it repositions, G1", gt=0, tune=Bound(3, 100, log=True)),
+        tunable("s", "without progress until it repositions, G1", 3, 100, log=True, gt=0),
     ] = 48.7
-    progress: Annotated[
-        Parameter, Spec("m", "progress of G1", gt=0, tune=Bound(0.005, 0.3, log=True))
-    ] = 0.04189
-    r: Annotated[Parameter, Spec("m", "from the contact to M, G2", gt=0, tune=Bound(0.08, 0.4))] = (
-        0.3235
+    progress: Annotated[Parameter, tunable("m", "progress of G1", 0.005, 0.3, log=True, gt=0)] = (
+        0.04189
     )
-    R: Annotated[
-        Parameter, Spec("m", "radius of the circle around M, G3", gt=0, tune=Bound(0.5, 1.4))
-    ] = 0.7371
+    r: Annotated[Parameter, tunable("m", "from the contact to M, G2", 0.08, 0.4, gt=0)] = 0.3235
+    R: Annotated[Parameter, tunable("m", "radius of the circle around M, G3", 0.5, 1.4, gt=0)] = (
+        0.7371
+    )
 
     @property
     def d_success(self) -> Number:

@@ -56,7 +56,7 @@ from rps_jax.control.observation import Details, Observation, Twist, displacemen
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number, Parameter
 from rps_jax.robot.shell import HALF_LENGTH
-from rps_jax.spec import Bound, Spec, document
+from rps_jax.spec import Spec, document, tunable
 
 MODES = "backing off", "driving around the object", "turning towards the target"
 _SIDE = 0.02  # [m] behind the front, where a contact is on a side
@@ -82,42 +82,34 @@ class UnicycleParams(NamedTuple):
     v_approach: ApproachSpeed = 0.03
     r: Annotated[
         Parameter,
-        Spec("m", "from the contact to the object's middle, D1", gt=0, tune=Bound(0.08, 0.4)),
+        tunable("m", "from the contact to the object's middle, D1", 0.08, 0.4, gt=0),
     ] = 0.2501
-    K_e: Annotated[
-        Parameter, Spec("1/s", "turn to the target, D4", ge=0, tune=Bound(0.1, 3, log=True))
-    ] = 2.558
-    K_l: Annotated[
-        Parameter, Spec("rad/s/m", "turn to the contact, D4", ge=0, tune=Bound(0.2, 8, log=True))
-    ] = 7.61
-    l_dead: Annotated[
-        Parameter, Spec("m", "offset up to which it does not, D4", ge=0, tune=Bound(0, 0.28))
-    ] = 0.07387
-    l_edge: Annotated[
-        Parameter, Spec("m", "offset of a spent contact", ge=0, tune=Bound(0.1, 0.35))
-    ] = 0.3263
-    e_far: Annotated[
-        Parameter, Spec("rad", "error of a spent contact", ge=0, tune=Bound(0.5, 3.4))
-    ] = 1.6
-    d_near: Annotated[Parameter, Spec("m", "distance of D5", ge=0, tune=Bound(0.05, 1))] = 0.5245
-    e_near: Annotated[
-        Parameter, Spec("rad", "error of a spent contact there", ge=0, tune=Bound(0.5, 2.5))
-    ] = 1.461
-    K_near: Annotated[Parameter, Spec("1", "gain of D5", ge=0, tune=Bound(0.3, 3))] = 1.974
+    K_e: Annotated[Parameter, tunable("1/s", "turn to the target, D4", 0.1, 3, log=True)] = 2.558
+    K_l: Annotated[Parameter, tunable("rad/s/m", "turn to the contact, D4", 0.2, 8, log=True)] = (
+        7.61
+    )
+    l_dead: Annotated[Parameter, tunable("m", "offset up to which it does not, D4", 0, 0.28)] = (
+        0.07387
+    )
+    l_edge: Annotated[Parameter, tunable("m", "offset of a spent contact", 0.1, 0.35)] = 0.3263
+    e_far: Annotated[Parameter, tunable("rad", "error of a spent contact", 0.5, 3.4)] = 1.6
+    d_near: Annotated[Parameter, tunable("m", "distance of D5", 0.05, 1)] = 0.5245
+    e_near: Annotated[Parameter, tunable("rad", "error of a spent contact there", 0.5, 2.5)] = 1.461
+    K_near: Annotated[Parameter, tunable("1", "gain of D5", 0.3, 3)] = 1.974
     t_lost: Annotated[
         Parameter,
-        Spec("s", "without contact until it is lost", gt=0, tune=Bound(0.2, 8, log=True)),
+        tunable("s", "without contact until it is lost", 0.2, 8, log=True, gt=0),
     ] = 0.3644
-    back: Annotated[Parameter, Spec("m", "way of a retreat", ge=0, tune=Bound(0.01, 0.6))] = 0.1
-    carrot: Annotated[
-        Parameter, Spec("rad", "aim ahead on the circle, D6", gt=0, tune=Bound(0.4, 1.5))
-    ] = 1.124
-    R: Annotated[
-        Parameter, Spec("m", "radius of the circle around M, D6", gt=0, tune=Bound(0.5, 1.4))
-    ] = 0.95
-    R_s: Annotated[
-        Parameter, Spec("m", "distance of the last W from M, D6", gt=0, tune=Bound(0.4, 1.4))
-    ] = 0.85
+    back: Annotated[Parameter, tunable("m", "way of a retreat", 0.01, 0.6)] = 0.1
+    carrot: Annotated[Parameter, tunable("rad", "aim ahead on the circle, D6", 0.4, 1.5, gt=0)] = (
+        1.124
+    )
+    R: Annotated[Parameter, tunable("m", "radius of the circle around M, D6", 0.5, 1.4, gt=0)] = (
+        0.95
+    )
+    R_s: Annotated[Parameter, tunable("m", "distance of the last W from M, D6", 0.4, 1.4, gt=0)] = (
+        0.85
+    )
 
 
 class Widths(NamedTuple):

@@ -230,13 +230,13 @@ class Corridor(Path):
 
     # Short, since long ones cut corners.
     lookahead: Annotated[Range, LOOKAHEAD] = Range(0.6, 0.6)
-    width: Annotated[
-        Range, Quantity("m", "width of the corridor", ge=0.3, le=20, owner="course")
-    ] = Range(1.4, 2.2)
+    width: Annotated[Range, Quantity("m", "width of the corridor", 0.3, 20, owner="course")] = (
+        Range(1.4, 2.2)
+    )
     doors: int = option(0, 0, 4)  # narrower places along the path
-    door_width: Annotated[
-        Range, Quantity("1", "doors, of the width", ge=0.1, le=1, owner="course")
-    ] = Range(0.8, 0.8)
+    door_width: Annotated[Range, Quantity("1", "doors, of the width", 0.1, 1, owner="course")] = (
+        Range(0.8, 0.8)
+    )
     touch: Literal["nothing", "object"] = "nothing"  # what may touch walls
     friction_wall: float = option(0.3, 0, 10)  # [1] of an object that may touch them
 

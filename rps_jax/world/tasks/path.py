@@ -30,7 +30,7 @@ from rps_jax.world.quantity import Quantity, Range, check_unused
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions
 from rps_jax.world.tasks.pose import PoseCourse, Posed, PoseProgress
 
-LOOKAHEAD = Quantity("m", "lookahead on the path", ge=0.05, le=5, owner="course")
+LOOKAHEAD = Quantity("m", "lookahead on the path", 0.05, 5, owner="course")
 _SEGMENTS = 8  # of a drawn path
 _PER_SPAN = 6  # segments of a spline between two waypoints
 _REACH = 1.0  # [m] along the path, either way, in which the nearest point is sought
@@ -168,15 +168,15 @@ class Path(Following):
     MARKS = ("waypoints",)
     NUMBERS = tuple(f"turn_angle_{i}" for i in range(_SEGMENTS - 1))
 
-    length: Annotated[Range, Quantity("m", "length of the path", ge=0.5, le=40, owner="course")] = (
-        Range(4, 8)
+    length: Annotated[Range, Quantity("m", "length of the path", 0.5, 40, owner="course")] = Range(
+        4, 8
     )
     turns: Annotated[
         Range,
-        Quantity("1", "number of turns", ge=0, le=_SEGMENTS - 1, owner="course", jumps=True),
+        Quantity("1", "number of turns", 0, _SEGMENTS - 1, owner="course", jumps=True),
     ] = Range(1, 3)
     turn_angle: Annotated[
-        Range, Quantity("rad", "angle of the turns", ge=0, le=1.6, owner="course", numbers=NUMBERS)
+        Range, Quantity("rad", "angle of the turns", 0, 1.6, owner="course", numbers=NUMBERS)
     ] = Range(0.3, 0.8)
     # [m] in the world, where the base starts at the origin; then nothing but the lookahead is drawn
     waypoints: tuple[tuple[float, float], ...] = ()

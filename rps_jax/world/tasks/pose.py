@@ -145,7 +145,7 @@ def _pushed_face(
     return faces[jnp.argmin(away)]
 
 
-_HEADING = Quantity("rad", "heading of the last push", ge=-_TURN, le=_TURN, owner="course")
+_HEADING = Quantity("rad", "heading of the last push", -_TURN, _TURN, owner="course")
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class Pose(Posed):
     heading: Annotated[Range, _HEADING] = Range(-math.pi, math.pi)
     turn: Annotated[
         float | None,
-        Spec("rad", "heading relative to the face that is first felt flush", ge=-_TURN, le=_TURN),
+        Spec("rad", "heading relative to the face that is first felt flush", -_TURN, _TURN),
     ] = None
     d_success: Annotated[float, Spec("m", "greatest error of the place", gt=0, le=1)] = 0.05
     yaw_success: Annotated[float, Spec("rad", "greatest error of the heading", gt=0, le=3.2)] = 0.1

@@ -65,8 +65,8 @@ class Rooms(Following):
     NUMBERS = ("route",)
 
     lookahead: Annotated[Range, LOOKAHEAD] = Corridor.lookahead
-    scale: Annotated[Range, Quantity("1", "scale of the map", ge=0.1, le=10, owner="course")] = (
-        Range(1, 1)
+    scale: Annotated[Range, Quantity("1", "scale of the map", 0.1, 10, owner="course")] = Range(
+        1, 1
     )
     # [m] both ends of each edge of closed outlines
     walls: tuple[tuple[float, float], ...] = option((), -1000, 1000, unit="m")
