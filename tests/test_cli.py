@@ -24,7 +24,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.robot.robot import ROBOTS
 from rps_jax.robot.skin import SKINS
-from rps_jax.runs.question import Question
+from rps_jax.runs.question import OutputCommand
 from rps_jax.runs.sweep import merge
 from rps_jax.trials.results import DIMS
 from rps_jax.tuning.evolution import TuneES
@@ -106,7 +106,7 @@ def test_other_options_get_a_numbered_folder(tmp_path, capsys, monkeypatch):
 def test_every_question_offers_and_every_call_accepts_overwrite(tmp_path):
     for name in names.known():
         question = names.question_type(name)
-        expected = ["--overwrite"] if issubclass(question, Question) else []
+        expected = ["--overwrite"] if issubclass(question, OutputCommand) else []
         flag_names = [
             flag
             for kind in (question, flags.session_type(question))

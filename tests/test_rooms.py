@@ -466,8 +466,11 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         "task start = (4.5, 2.0, 0.0) is not allowed: it lies in an obstacle",
     ),
     "goal in an overlap": (HALL | {"polygons": OVERLAP, "goal": [5.5, 2]}, "task goal = (5.5, 2"),
-    "degrees": (HALL | {"start": [1.5, 2, 90]}, "yaw of task start = 90.0 is not allowed: it must"),
-    "degrees of a map": (ROS | {"origin": [0, 0, 180]}, "yaw of task origin = 180.0"),
+    "degrees": (
+        HALL | {"start": [1.5, 2, 90]},
+        "yaw of task start = 90 is not allowed: it is beyond 2 pi",
+    ),
+    "degrees of a map": (ROS | {"origin": [0, 0, 180]}, "yaw of task origin = 180 is"),
     "an outline of an image": (
         ROS | {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]]},
         "the image defines the outline",

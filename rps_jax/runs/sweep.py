@@ -265,6 +265,7 @@ class Merge(PlanQuestion):
 
     def answer(self, run: Run) -> xr.Dataset:
         first, *rest = folders = [Path(folder) for folder in self.folders]
+        out = run_folder.ensure_writable(Path(str(self.out)))
         manifest = run_folder.read_manifest(first)
         for folder in rest:
             if (shard := run_folder.read_manifest(folder)) != manifest:
@@ -275,7 +276,7 @@ class Merge(PlanQuestion):
         attrs = self.attributes() | attributes_of(self.plan)
         merged = Results(self.plan).read_all(folders).assign_attrs(attrs)
         environments = [*map(provenance.read_environment, folders)]
-        out = open_run(Path(str(self.out)), self.plan)
+        open_run(out, self.plan)
         for environment in environments:
             provenance.write_environment(out, environment)
         return write_dataset(merged, out)
