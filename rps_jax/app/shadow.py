@@ -21,7 +21,7 @@ from rps_jax.control.observation import Twist, with_base
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Pytree
+from rps_jax.geometry.arrays import Array, Pytree
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.record import bag as bags
 from rps_jax.record.files import Arrays
@@ -183,7 +183,7 @@ def shadowed(law: Law, params: LawParams, recorded: Arrays, robot: Robot = Robot
         check_taxels(recorded["signal"], robot.shell, "the bag")
         values |= recorded_ends(recorded["signal"], robot)
 
-    def value_of(path: Pytree, shape: jax.ShapeDtypeStruct) -> jax.Array:
+    def value_of(path: Pytree, shape: jax.ShapeDtypeStruct) -> Array:
         """Return the values (N, ...) of a field of the observation."""
         if (name := path[-1].name) not in values:
             raise InputError(
@@ -193,7 +193,7 @@ def shadowed(law: Law, params: LawParams, recorded: Arrays, robot: Robot = Robot
         return jnp.asarray(values[name], shape.dtype)
 
     @jax.jit
-    def run(params: LawParams, observations: PyTree) -> jax.Array:
+    def run(params: LawParams, observations: PyTree) -> Array:
         def step(state: PyTree, row: PyTree) -> PyTree:
             sensed, last = row
             obs = with_base(sensed, robot.radius, robot)

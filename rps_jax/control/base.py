@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax.control.observation import Details, Twist
-from rps_jax.geometry.arrays import Parameter, Pytree
+from rps_jax.geometry.arrays import Array, Parameter, Pytree
 from rps_jax.record import files
 from rps_jax.robot.base import LoadCell
 from rps_jax.robot.robot import DriveKind
@@ -66,7 +66,7 @@ ApproachSpeed = Annotated[Parameter, Spec("m/s", "forward speed before the first
 SuccessDistance = Annotated[Parameter, Spec("m", "target reached", gt=0)]
 
 T = TypeVar("T")
-Leaf = float | np.ndarray | jax.Array  # of a pytree of parameters
+Leaf = float | np.ndarray | Array  # of a pytree of parameters
 Params = TypeVar("Params", bound=LawParams)
 State = TypeVar("State")  # a pytree of arrays
 Obs = TypeVar("Obs")
@@ -175,7 +175,7 @@ class Law(Generic[Params, State, Obs]):
     heading: bool = False
     follows: bool = False  # whether a law with a heading follows paths, while this is NaN
     # state -> bool: whether the law declares that it is done, which ends the trial.
-    is_done: Callable[[State], jax.Array] | None = None
+    is_done: Callable[[State], Array] | None = None
     memory: Callable[[State], Memory] | None = None  # state -> Memory of one trial
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None

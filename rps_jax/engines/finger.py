@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Entries, Float, Pytree
+from rps_jax.geometry.arrays import Array, Entries, Float, Pytree
 from rps_jax.geometry.friction import friction_of_pads, solved
 from rps_jax.geometry.vectors import Vec, trace_one_world
 
@@ -39,18 +39,18 @@ _PAD = 0.36  # [1] radius of a pad over the width of its cell
 class Slider(NamedTuple):
     """Object that a finger pushes; in the frame of the object."""
 
-    outline: Float[jax.Array, "N 2"]  # [m] corners of a simple polygon, counter-clockwise
+    outline: Float[Array, "N 2"]  # [m] corners of a simple polygon, counter-clockwise
     # x, y [m], share of the load [1] and radius [m] of pads
-    pads: Float[jax.Array, "S 4"]
-    friction: Float[jax.Array, ""]  # [1] with the finger
-    radius: Float[jax.Array, ""]  # [m] of the finger
+    pads: Float[Array, "S 4"]
+    friction: Float[Array, ""]  # [1] with the finger
+    radius: Float[Array, ""]  # [m] of the finger
 
 
 class Pushed(NamedTuple):
     """Motion of objects."""
 
-    pose: Float[jax.Array, "B T 3"]  # [m, m, rad] of the object's frame, the first at the start
-    gap: Float[jax.Array, "B T"]  # [m] between finger and outline
+    pose: Float[Array, "B T 3"]  # [m, m, rad] of the object's frame, the first at the start
+    gap: Float[Array, "B T"]  # [m] between finger and outline
 
 
 def check_outline(outline: ArrayLike) -> np.ndarray:
@@ -101,9 +101,7 @@ def uniform_pads(outline: np.ndarray, count: int = _NODES) -> np.ndarray:
 
 
 @jax.jit(static_argnames="steps")
-def push(
-    slider: Slider, path: Float[jax.Array, "B P 2"], pose: jax.Array, steps: int = STEPS
-) -> Pushed:
+def push(slider: Slider, path: Float[Array, "B P 2"], pose: Array, steps: int = STEPS) -> Pushed:
     """Push objects from poses (B, 3) [m, m, rad] along paths of the finger's middle [m, world].
 
     The leaves of `slider` may have a leading axis B. The finger goes straight between points of a
@@ -121,7 +119,7 @@ def push(
         return jax.lax.map(push_one, (own, path, pose), batch_size=_TOGETHER)
 
 
-def _push(slider: Slider, path: jax.Array, pose: jax.Array, steps: int) -> Pushed:
+def _push(slider: Slider, path: Array, pose: Array, steps: int) -> Pushed:
     """Return one push."""
     lengths = jnp.sqrt(jnp.sum(jnp.diff(path, axis=0) ** 2, axis=1) + 1e-18)
     along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(lengths)])
@@ -143,7 +141,7 @@ def distances(outline: ArrayLike, points: ArrayLike) -> np.ndarray:
     return np.asarray(jax.vmap(lambda point: _nearest(corners, point)[0])(jnp.asarray(points)))
 
 
-def _nearest(outline: jax.Array, point: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _nearest(outline: Array, point: Array) -> tuple[Array, Array]:
     """Return the signed distance [m] of a point from a polygon, and the outward normal (2,)."""
     ahead = jnp.roll(outline, -1, axis=0)
     way, offset = ahead - outline, point - outline
@@ -164,16 +162,14 @@ def _nearest(outline: jax.Array, point: jax.Array) -> tuple[jax.Array, jax.Array
     return jnp.where(is_near, jnp.sum(offset[i] * side), sign * distance), normal
 
 
-def gap_of(
-    slider: Slider, pose: jax.Array, tip: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def gap_of(slider: Slider, pose: Array, tip: Array) -> tuple[Array, Array, Array]:
     """Return the gap [m] of a finger, the outward normal and the contact point, in the body."""
     local = planar.rotate(-pose[2], tip - pose[:2])
     distance, normal = _nearest(slider.outline, local)
     return distance - slider.radius, normal, local - distance * normal
 
 
-def _step(slider: Slider, unit: jax.Array, carry: tuple, tip: jax.Array) -> tuple:
+def _step(slider: Slider, unit: Array, carry: tuple, tip: Array) -> tuple:
     """Return pose and guesses after one step of the finger, with pose and gap before it."""
     pose, (spin, flow) = carry
     gap, normal, contact = gap_of(slider, pose, tip[0])
@@ -216,7 +212,7 @@ def _iterate(refine: Callable[[tuple], tuple], start: tuple) -> tuple:
         new = refine(x)
         return count + 1, new, jnp.max(jnp.abs(new[0] - x[0]))
 
-    def unfinished(carry: tuple) -> jax.Array:
+    def unfinished(carry: tuple) -> Array:
         return (carry[0] < _ITERATIONS) & (carry[2] > enough)
 
     return jax.lax.while_loop(
@@ -224,14 +220,14 @@ def _iterate(refine: Callable[[tuple], tuple], start: tuple) -> tuple:
     )[1]
 
 
-def _power(pads: tuple, v: Vec) -> jax.Array:
+def _power(pads: tuple, v: Vec) -> Array:
     """Return the power of friction at a twist."""
     x, y, share, radius = pads
     u, w = v[0] - v[2] * y, v[1] + v[2] * x
     return share @ jnp.sqrt(u * u + w * w + (v[2] * radius) ** 2 + _SMOOTH**2)
 
 
-def _pull(pads: tuple, v: jax.Array, spin: jax.Array) -> tuple[jax.Array, ...]:
+def _pull(pads: tuple, v: Array, spin: Array) -> tuple[Array, ...]:
     """Return force (2,), torque and its slope of friction at a velocity and spin."""
     x, y, share, radius = pads
     u, w, t = v[0] - spin * y, v[1] + spin * x, spin * radius
@@ -241,7 +237,7 @@ def _pull(pads: tuple, v: jax.Array, spin: jax.Array) -> tuple[jax.Array, ...]:
     return jnp.stack([load @ u, load @ w]), load @ flow, slope
 
 
-def _turn(pads: tuple, v: jax.Array, spin: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _turn(pads: tuple, v: Array, spin: Array) -> tuple[Array, Array]:
     """Return the spin of least power at a velocity (2,) of the contact, and the force (2,).
 
     Newton's method with a bracket; the last step alone is differentiated.
@@ -263,7 +259,7 @@ def _turn(pads: tuple, v: jax.Array, spin: jax.Array) -> tuple[jax.Array, jax.Ar
     return spin, _pull(pads, v, spin)[0]
 
 
-def _slide(pads: tuple, force: jax.Array, flow: jax.Array, stuck: jax.Array) -> jax.Array:
+def _slide(pads: tuple, force: Array, flow: Array, stuck: Array) -> Array:
     """Return the twist (3,) about the contact under a force (2,) there, of any scale.
 
     It minimises half of the squared power less the force times the velocity. Guesses are the last
@@ -272,7 +268,7 @@ def _slide(pads: tuple, force: jax.Array, flow: jax.Array, stuck: jax.Array) -> 
     constant: Pytree = jax.lax.stop_gradient((pads, (force[0], force[1], 0.0), flow, stuck))
     fixed, pull, flow, stuck = constant
 
-    def cost(v: Vec) -> jax.Array:
+    def cost(v: Vec) -> Array:
         return _power(fixed, v) ** 2 / 2 - pull[0] * v[0] - pull[1] * v[1]
 
     def refine(carry: tuple) -> tuple:

@@ -31,7 +31,7 @@ from rps_jax.engines.mjx_colliders import (
 )
 from rps_jax.engines.mujoco import compile_rows
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Entries, Pytree
+from rps_jax.geometry.arrays import Array, Entries, Pytree
 from rps_jax.record.files import Arrays
 from rps_jax.robot.base import Tyres, push
 from rps_jax.robot.robot import Robot
@@ -64,7 +64,7 @@ class MJXStage(NamedTuple):
     native = False
     engine = "mjx"
 
-    def drive(self, fields: dict[str, jax.Array], motion: Motion, period: ControlPeriod) -> Driven:
+    def drive(self, fields: dict[str, Array], motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period.
 
         Before each step, the twist is written into the base's joint velocities, in the world's
@@ -77,7 +77,7 @@ class MJXStage(NamedTuple):
         # Derivatives compute each step again, without its solver.
         step = jax.checkpoint(step, prevent_cse=False, policy=mjx_gradients.SAVED)
 
-        def body(state: Motion, _: None) -> tuple[Motion, jax.Array | None]:
+        def body(state: Motion, _: None) -> tuple[Motion, Array | None]:
             # vmap inside of the loop: JAX would trace a batched loop again.
             state, wrench = step(fields, state, period.twists, period.robot)
             return state, wrench if period.force else None
@@ -85,7 +85,7 @@ class MJXStage(NamedTuple):
         motion, wrenches = jax.lax.scan(body, motion, length=physics.substeps)
         return Driven(motion, force=None if wrenches is None else wrenches.mean(axis=0))
 
-    def _with_walls(self, fields: dict[str, jax.Array], qpos: jax.Array) -> dict[str, jax.Array]:
+    def _with_walls(self, fields: dict[str, Array], qpos: Array) -> dict[str, Array]:
         """Return fields whose walls are those nearest to the object."""
         model, free = apply(self.model, fields), tuple(qpos[JOINTS.object])
         corners: Entries = tuple(corners_of(model, fields.get(OUTLINE)).T)
@@ -100,12 +100,12 @@ class MJXStage(NamedTuple):
 
     def _step(
         self,
-        fields: dict[str, jax.Array],
+        fields: dict[str, Array],
         state: Motion,
         twist: Twist,
         robot: Robot | None,
         timestep: float,
-    ) -> tuple[Motion, jax.Array]:
+    ) -> tuple[Motion, Array]:
         """Return a world after one step, and the wrench (3,) on its base, in the base's frame."""
         model, (qpos, qvel, warmstart, integral) = apply(self.model, fields), state
         data, sideways = self.data, None
@@ -135,9 +135,7 @@ class MJXStage(NamedTuple):
         return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral), wrench
 
 
-def step(
-    model: mjx.Model, data: mjx.Data, *extra: Extra, inertia: jax.Array | None = None
-) -> mjx.Data:
+def step(model: mjx.Model, data: mjx.Data, *extra: Extra, inertia: Array | None = None) -> mjx.Data:
     """Compute one step by functions of MJX and our colliders; `extra` is that of `collision`.
 
     An `inertia` (3, 3) of tyres is added to that of the base's joints. Unused features are left
@@ -209,7 +207,7 @@ def fields_of(model: mujoco.MjModel, names: Sequence[str] = FIELDS) -> Arrays:
     return {name: np.array(attrgetter(name[1:])(model), float) for name in names}
 
 
-def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
+def apply(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:
     """Return the model with the fields of one world, named as by `fields_of`."""
     return jax.tree_util.tree_map_with_path(
         lambda path, leaf: fields.get(jax.tree_util.keystr(path), leaf), model

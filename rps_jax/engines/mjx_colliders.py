@@ -26,7 +26,7 @@ import numpy as np
 
 from rps_jax.engines.fused.contacts import Corners, side_contacts
 from rps_jax.geometry import vectors
-from rps_jax.geometry.arrays import Entries, Pytree
+from rps_jax.geometry.arrays import Array, Entries, Pytree
 from rps_jax.world import opengl as opengl  # imports MuJoCo
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
@@ -47,7 +47,7 @@ _UPRIGHT = 1e-6  # [rad] tilt below which all points of the rim are equally low
 
 
 @collision_primitive.collider(ncon=3)
-def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> tuple[jax.Array, jax.Array, jax.Array]:
+def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> tuple[Array, Array, Array]:
     """Return distances (3,), points (3, 3) and frames (3, 3, 3) [m] of an upright cylinder.
 
     The three points are on the lower rim, a third of a turn apart, the lowest first.
@@ -73,7 +73,7 @@ def geoms(model: Model, body: int, kind: GeomType) -> np.ndarray:
     return np.flatnonzero((model.geom_bodyid == body) & (model.geom_type == kind))
 
 
-def corners_of(model: Model, outline: jax.Array | None = None) -> jax.Array:
+def corners_of(model: Model, outline: Array | None = None) -> Array:
     """Return the corners (N, 3) [m] of box or prism in its body, or the middle of a cylinder."""
     boxes = geoms(model, _OBJECT, GeomType.BOX)
     if boxes.size:
@@ -88,7 +88,7 @@ def corners_of(model: Model, outline: jax.Array | None = None) -> jax.Array:
 
 
 def _with_upright(
-    model: Model, data: Data, key: Any, geom: object, outline: jax.Array | None = None
+    model: Model, data: Data, key: Any, geom: object, outline: Array | None = None
 ) -> Collision:
     """Return distances (C,), points (C, 3) and frames (C, 3, 3) [m] of an upright box or prism."""
     pairs = collision_driver._geom_groups(model)[key]
@@ -99,7 +99,7 @@ def _with_upright(
     return jax.tree.map(lambda *x: jnp.concatenate(x), *contacts)
 
 
-def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array) -> Collision:
+def upright(model: Model, data: Data, base: int, prism: int, corners: Array) -> Collision:
     """Return distances (C,), points (C, 3) and frames (C, 3, 3) [m] of base and upright prism.
 
     `base` and `prism` are geoms; `corners` (N, 3) [m] are those of the prism in its body. The base
@@ -132,7 +132,7 @@ def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array)
     return distance, points, jnp.stack([frame] * len(distance))
 
 
-Extra = jax.Array | None  # numbers of a world that a model lacks
+Extra = Array | None  # numbers of a world that a model lacks
 Pair = tuple[GeomType, GeomType]
 # Each has the number of points of MJX's collider of the pair, for which `Data` has space.
 COLLIDERS: dict[Pair, Any] = {

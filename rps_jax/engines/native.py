@@ -43,7 +43,7 @@ from jax.interpreters import ad, batching, mlir
 
 from rps_jax.engines import device
 from rps_jax.geometry import vectors
-from rps_jax.geometry.arrays import Pytree
+from rps_jax.geometry.arrays import Array, Pytree
 from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu import WARP, GpuWriter, shared_size
 from rps_jax.lowering.graph import CompilerError, TooLargeError, UnsupportedError, first_array
@@ -229,7 +229,7 @@ def scan(
     leaves, tree = jax.tree.flatten((state, constants))
     count = len(jax.tree.leaves(state))
 
-    def run(values: list[jax.Array], varied: Collection[int] | None = None) -> Pytree:
+    def run(values: list[Array], varied: Collection[int] | None = None) -> Pytree:
         groups: dict[tuple[object, ...], list[int]] = {}  # of the state, then of the constants
         for i, x in enumerate(values):
             key = i >= count, x.dtype, i >= count and i in (varied or ())
@@ -237,10 +237,10 @@ def scan(
         carried = sum(not is_constant for is_constant, *_ in groups)
         restore: Pytree = [ravel_pytree([values[i][0] for i in x])[1] for x in groups.values()]
 
-        def packed(leaves: Sequence[jax.Array], indices: Sequence[list[int]]) -> list[jax.Array]:
+        def packed(leaves: Sequence[Array], indices: Sequence[list[int]]) -> list[Array]:
             return [ravel_pytree([leaves[i] for i in x])[0] for x in indices]
 
-        def unpacked(arrays: Sequence[jax.Array], indices: Sequence[list[int]]) -> list[jax.Array]:
+        def unpacked(arrays: Sequence[Array], indices: Sequence[list[int]]) -> list[Array]:
             parts = [f(x) for f, x in zip(restore, arrays, strict=False)]
             pairs = zip(itertools.chain(*indices), itertools.chain(*parts), strict=True)
             return [x for _, x in sorted(pairs, key=operator.itemgetter(0))]
@@ -313,7 +313,7 @@ def _tangents(
 def concurrent(
     functions: Sequence[Function],
     fallback: Callable[..., Sequence[Pytree]],
-    sort_by: Callable[..., jax.Array] | None = None,
+    sort_by: Callable[..., Array] | None = None,
     strict: bool = False,
 ) -> Callable[..., Pytree]:
     """Return functions of batches of worlds as one function; a GPU runs them at the same time.
@@ -352,7 +352,7 @@ def concurrent(
             inputs = [[*x, order] for x, order in zip(inputs, orders, strict=True)]
         flat_inputs, inputs_tree = jax.tree.flatten(inputs)
 
-        def run_libraries(values: Sequence[Pytree], _: Pytree) -> list[jax.Array]:
+        def run_libraries(values: Sequence[Pytree], _: Pytree) -> list[Array]:
             """Call the libraries, for which it waits until they are compiled."""
             leaves = inputs_tree.unflatten(values)
             try:
@@ -363,7 +363,7 @@ def concurrent(
                 pairs = zip(types, leaves, strict=True)
                 trees = [tree.unflatten(x[: len(kinds)]) for (tree, kinds), x in pairs]
                 return jax.tree.leaves(list(fallback(*trees)))
-            owners, results = iter(leaves), list[jax.Array]()
+            owners, results = iter(leaves), list[Array]()
             for (group, _), name in zip(groups, names, strict=True):
                 shapes = [x for call in group for x in call.shapes]
                 run_library = jax.ffi.ffi_call(name, shapes, vmap_method="broadcast_all")
@@ -438,7 +438,7 @@ class _Function:
         function: Function,
         tree: Pytree,
         types: Sequence[tuple[Pytree, Pytree]],
-        sort_by: Callable[..., jax.Array] | None,
+        sort_by: Callable[..., Array] | None,
     ) -> None:
         trace: Any = _trace_keyed if isinstance(function, Keyed) else _Trace
         self.trace = trace(function, tree, tuple((shape[1:], dtype) for shape, dtype in types))
@@ -566,7 +566,7 @@ def _register(name: str, body: bytes) -> None:
 # --- linear maps ---------------------------------------------------------------------------------
 
 # Of residuals (on which the map depends) and of vectors: tuples of arrays.
-Map: TypeAlias = Callable[[Sequence[Pytree], Sequence[Pytree]], Sequence[jax.Array]]
+Map: TypeAlias = Callable[[Sequence[Pytree], Sequence[Pytree]], Sequence[Array]]
 Maps: TypeAlias = tuple[Map, Map | None]
 
 
@@ -577,7 +577,7 @@ def linear_map(
     vectors: Sequence[Pytree],
     like: Pytree,
     label: str = "",
-) -> list[jax.Array]:
+) -> list[Array]:
     """Return `forward(residuals, vectors)`, linear in the vectors, with a given transpose.
 
     Args:
@@ -622,7 +622,7 @@ _primitive.multiple_results = True
 
 
 @_primitive.def_impl
-def _run(*arrays: Pytree, maps: Maps, count: int, **_: object) -> list[jax.Array]:
+def _run(*arrays: Pytree, maps: Maps, count: int, **_: object) -> list[Array]:
     return list(maps[0](arrays[:count], arrays[count:]))
 
 
@@ -669,7 +669,7 @@ batching.primitive_batchers[_primitive] = _batch
 mlir.register_lowering(_primitive, mlir.lower_fun(_run, multiple_results=True))
 
 
-def _jvp_once(primals: Pytree, tangents: Pytree, derived: bool) -> tuple[jax.Array, Pytree]:
+def _jvp_once(primals: Pytree, tangents: Pytree, derived: bool) -> tuple[Array, Pytree]:
     return _refuse() if derived else (_once.bind(*primals, derived=True), *tangents)
 
 

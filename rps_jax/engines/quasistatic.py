@@ -33,7 +33,7 @@ from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
 from rps_jax.engines.fused.contacts import Point, circle_and_base, polygon_and_base
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
-from rps_jax.geometry.arrays import Entries, Number
+from rps_jax.geometry.arrays import Array, Entries, Number
 from rps_jax.geometry.friction import ENTRIES, friction_of_pads, solved
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world import scene
@@ -153,7 +153,7 @@ def solve(problem: Problem, v: Vec, dt: float) -> Vec:
     fixed, v = jax.lax.stop_gradient((problem, v))
     widening = _ITERATIONS - _SHARP
 
-    def newton(i: jax.Array, v: Vec) -> Vec:
+    def newton(i: Array, v: Vec) -> Vec:
         slip = SLIP ** jnp.minimum(i / widening, 1.0).astype(v[0].dtype)
         gradient, hessian = derivatives(fixed, v, slip, dt)
         return sp.sub(v, solved(gradient, hessian))

@@ -26,12 +26,12 @@ def unit(angle: Floats) -> Float[Array, "*B 2"]:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
-def _components(vector: jax.Array) -> list[jax.Array]:
+def _components(vector: Array) -> list[Array]:
     """Return the components (...) of vectors (..., n) for a small n: see `footprint`."""
     return [vector[..., i] for i in range(vector.shape[-1])]
 
 
-def _scale(vector: jax.Array) -> jax.Array:
+def _scale(vector: Array) -> Array:
     """Return the largest component (...) of vectors (..., n); zero only for a zero vector.
 
     It is bounded, since the reciprocal of a larger float32 is subnormal, which XLA takes for zero.

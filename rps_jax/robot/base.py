@@ -32,7 +32,7 @@ from jax.typing import DTypeLike
 
 from rps_jax import spec
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Number, Pair
+from rps_jax.geometry.arrays import Array, Number, Pair
 from rps_jax.geometry.vectors import Vec, turned
 from rps_jax.robot.robot import Robot
 from rps_jax.spec import Spec
@@ -60,15 +60,15 @@ class Odometry(NamedTuple):
     velocity_error: Annotated[
         Number, Spec("1", "error of each component of the twist, or of two wheels")
     ] = 0.0  # (3,)
-    past: np.ndarray | jax.Array = np.zeros(0)  # (K,)
+    past: np.ndarray | Array = np.zeros(0)  # (K,)
 
 
 def observe_pose(
     odometry: Odometry,
-    poses: jax.Array,
-    pose: jax.Array,
-    key: jax.Array,
-    steps: jax.Array,
+    poses: Array,
+    pose: Array,
+    key: Array,
+    steps: Array,
     period: float,
 ) -> Pair:
     """Return the latest poses (K, 3), the current `pose` (3,) first, and the observed pose (3,).
@@ -84,19 +84,19 @@ def observe_pose(
     return poses, delayed + sigma * normal(noise, (3,), pose.dtype)
 
 
-def normal(key: jax.Array, shape: tuple[int, ...], dtype: DTypeLike) -> jax.Array:
+def normal(key: Array, shape: tuple[int, ...], dtype: DTypeLike) -> Array:
     """Return normal numbers that are equal in single and double precision."""
     return jax.random.normal(key, shape, jnp.float32).astype(dtype)
 
 
-def delay_twist(odometry: Odometry, twists: jax.Array, twist: jax.Array, period: float) -> Pair:
+def delay_twist(odometry: Odometry, twists: Array, twist: Array, period: float) -> Pair:
     """Return the latest commanded twists (K, 3), `twist` (3,) first, and the delayed one (3,)."""
     twists = jnp.concatenate([twist[None], twists[:-1]])
     delayed = twists[_steps_of(odometry.command_delay, period)]
     return twists, delayed
 
 
-def _steps_of(time: Number, period: float) -> jax.Array:
+def _steps_of(time: Number, period: float) -> Array:
     return jnp.round(time / period).astype(jnp.int32)
 
 
@@ -119,9 +119,7 @@ class LoadCell(NamedTuple):
         """Raise InputError for noise, filter or threshold that no sensor can have."""
         spec.check(self, "load cell ")
 
-    def read(
-        self, load: Load, key: jax.Array, steps: jax.Array, period: float
-    ) -> tuple[Load, jax.Array]:
+    def read(self, load: Load, key: Array, steps: Array, period: float) -> tuple[Load, Array]:
         """Read the force (2,) [N] of the object on the base, in the base's frame.
 
         The reading follows `steps` () control steps, `period` [s] after the previous one.
@@ -139,12 +137,12 @@ class Load(NamedTuple):
 
     # In the base's frame.
     wrench: Annotated[
-        jax.Array, Spec("N, N, N m", "wrench of the object on the base in the last period")
+        Array, Spec("N, N, N m", "wrench of the object on the base in the last period")
     ]  # (3,)
-    signal: Annotated[jax.Array, Spec("N", "filtered force")]  # (2,)
+    signal: Annotated[Array, Spec("N", "filtered force")]  # (2,)
 
 
-def init_load(template: jax.Array) -> Load:
+def init_load(template: Array) -> Load:
     """Return the state before the first reading, in the precision of `template`."""
     return Load(jnp.zeros(3, template.dtype), jnp.zeros(2, template.dtype))
 
@@ -160,18 +158,18 @@ GRIP = 1e3  # [1] mass of a base sideways, over its own mass
 class Drive(NamedTuple):
     """State of the drive of a base with limits."""
 
-    aim: jax.Array  # (3,) [m/s, m/s, rad/s] the aimed twist, in the base's frame
-    integral: jax.Array  # (3,) [N, N, N m] of the servo, in the base's frame
-    stalled: jax.Array  # () int32 consecutive control steps in which it stood still, pushing
+    aim: Array  # (3,) [m/s, m/s, rad/s] the aimed twist, in the base's frame
+    integral: Array  # (3,) [N, N, N m] of the servo, in the base's frame
+    stalled: Array  # () int32 consecutive control steps in which it stood still, pushing
 
 
-def init_drive(template: jax.Array) -> Drive:
+def init_drive(template: Array) -> Drive:
     """Return the drive of a base at rest, in the precision of `template`."""
     still = jnp.zeros(3, template.dtype)
     return Drive(still, still, jnp.zeros((), jnp.int32))
 
 
-def aim(robot: Robot, previous: jax.Array, twist: jax.Array, period: float) -> jax.Array:
+def aim(robot: Robot, previous: Array, twist: Array, period: float) -> Array:
     """Return the aimed twist (3,), after the `previous` aim (3,) and a commanded `twist` (3,).
 
     Twists are in the base's frame [m/s, m/s, rad/s]; `period` [s] is the control period.
@@ -198,10 +196,10 @@ def aim(robot: Robot, previous: jax.Array, twist: jax.Array, period: float) -> j
     return twist
 
 
-def _aim_axle(robot: Robot, previous: jax.Array, twist: jax.Array, period: float) -> jax.Array:
+def _aim_axle(robot: Robot, previous: Array, twist: Array, period: float) -> Array:
     """Return the aim of a base whose axle cannot move sideways: see `aim`."""
 
-    def scaled(motion: jax.Array, *limits: Number | None) -> jax.Array:
+    def scaled(motion: Array, *limits: Number | None) -> Array:
         """Return (v, omega) with bounded |v|, |omega| and speeds of both wheels."""
         v, omega = jnp.abs(motion)
         sizes = v, omega, v + robot.half_track * omega
@@ -221,7 +219,7 @@ def _aim_axle(robot: Robot, previous: jax.Array, twist: jax.Array, period: float
     return jnp.stack([v, robot.axle_behind * omega, omega])
 
 
-def _steered(robot: Robot, v: jax.Array, omega: jax.Array) -> jax.Array:
+def _steered(robot: Robot, v: Array, omega: Array) -> Array:
     """Return (v, omega) within the turning radius."""
     if robot.turning_radius is not None:
         bound = jnp.abs(v) / robot.turning_radius
@@ -229,7 +227,7 @@ def _steered(robot: Robot, v: jax.Array, omega: jax.Array) -> jax.Array:
     return jnp.stack([v, omega])
 
 
-def apply_errors(robot: Robot | None, twist: jax.Array, errors: Number) -> jax.Array:
+def apply_errors(robot: Robot | None, twist: Array, errors: Number) -> Array:
     """Return a commanded twist (3,) with the relative errors (3,) [1] of a drive.
 
     They are those of the twist's components, or of the two wheels of a differential drive.
@@ -242,7 +240,7 @@ def apply_errors(robot: Robot | None, twist: jax.Array, errors: Number) -> jax.A
     return jnp.stack([(left + right) / 2, robot.axle_behind * omega, omega])
 
 
-def apply_slip(robot: Robot, aim: jax.Array) -> jax.Array:
+def apply_slip(robot: Robot, aim: Array) -> Array:
     """Return the twist (3,) of wheels that slip, which the base's own sensors do not measure."""
     shares = [robot.slip if x is None else x for x in (None, robot.slip_sideways, robot.slip_yaw)]
     if all(share is None for share in shares):
@@ -334,7 +332,7 @@ class Tyres(NamedTuple):
         return x, y, z
 
 
-def count_stalled_steps(robot: Robot, drive: Drive, qvel: jax.Array) -> Drive:
+def count_stalled_steps(robot: Robot, drive: Drive, qvel: Array) -> Drive:
     """Return the drive with the count of control steps in which the base stands still, pushing.
 
     `qvel` (9,) is that of a trial: the base's velocity [m/s, m/s, rad/s] in the world comes first.
@@ -344,6 +342,6 @@ def count_stalled_steps(robot: Robot, drive: Drive, qvel: jax.Array) -> Drive:
     return drive._replace(stalled=jnp.where(stands, drive.stalled + 1, 0))
 
 
-def has_stalled(drive: Drive | None, period: float) -> jax.Array | bool:
+def has_stalled(drive: Drive | None, period: float) -> Array | bool:
     """Whether () a base has stood still for `_STALL`; `period` [s] is the control period."""
     return False if drive is None else drive.stalled * period >= _STALL

@@ -21,7 +21,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Number
+from rps_jax.geometry.arrays import Array, Number
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.options import check_fields
 from rps_jax.spec import Spec
@@ -66,7 +66,7 @@ BOARDS = (Boards("left", 5), Boards("front", 4), Boards("right", 5))  # 14 board
 class Row(NamedTuple):
     """Part of a side that a row of boards covers."""
 
-    start: jax.Array  # (2,) [m] in the robot frame
+    start: Array  # (2,) [m] in the robot frame
     along: np.ndarray  # (2,) unit vector; of a round base not used
     length: Number  # () [m]
     offset: Number  # () [m] of its start along the strip
@@ -134,7 +134,7 @@ class Shell:
             rows.append(Row(shifted, along, length, offset + gap))
         return rows
 
-    def taxels(self, samples: int = 1) -> jax.Array:
+    def taxels(self, samples: int = 1) -> Array:
         """Return sample points (T, samples, 2) [m] of the taxels in the robot frame."""
         points = []
         for boards, row in zip(self.boards, self.rows(), strict=True):
@@ -145,7 +145,7 @@ class Shell:
             points.append(line.reshape(-1, samples, 2))
         return jnp.concatenate(points)
 
-    def on_strip(self, s: jax.Array) -> jax.Array:
+    def on_strip(self, s: Array) -> Array:
         """Return points (..., 2) [m] in the robot frame at positions `s` (...) [m] of the strip."""
         if self.radius is not None:
             radius = jnp.asarray(self.radius, s.dtype)
@@ -154,7 +154,7 @@ class Shell:
         along = jnp.clip(s, 0, 2 * x) - jnp.clip(s - 2 * (x + y), 0, 2 * x)  # left and right side
         return jnp.stack([along - x, y - jnp.clip(s - 2 * x, 0, 2 * y)], axis=-1)
 
-    def on_arc(self, bearing: jax.Array) -> jax.Array:
+    def on_arc(self, bearing: Array) -> Array:
         """Return positions [m] of a round base's strip at bearings [rad] in the robot frame."""
         return jnp.asarray(self.sizes[0], bearing.dtype) * (_ARC / 2 - bearing)
 

@@ -65,7 +65,7 @@ class Reading(NamedTuple):
 class SkinState(NamedTuple):
     """State of a sensor between two readings; empty for the ideal one."""
 
-    key: Annotated[jax.Array, Spec("1", "key of the noise of later readings")]
+    key: Annotated[Array, Spec("1", "key of the noise of later readings")]
     signal: Annotated[
         Float[Array, "*B T"], Spec("1", "filtered relative change of capacitance of each taxel")
     ]
@@ -190,7 +190,7 @@ class CapacitiveSkin(NamedTuple):
         depth = (self.foam - fp.signed_distance(footprint, line)).reshape(samples.shape[1::-1]).T
         return jnp.clip(depth, 0.0, self.max_compression * self.foam)
 
-    def _scan(self, state: SkinState, footprint: Footprint) -> tuple[SkinState, jax.Array]:
+    def _scan(self, state: SkinState, footprint: Footprint) -> tuple[SkinState, Array]:
         """Return the raw signals (T,) [1] of all taxels, with gains and noise."""
         share = self.foam / (self.foam - self.compression(footprint))
         # A loop over samples: reductions of such short axes are slow on every device.
@@ -199,7 +199,7 @@ class CapacitiveSkin(NamedTuple):
         noise = self.noise * normal(key_noise, change.shape, change.dtype)
         return state._replace(key=key), state.gain * change + noise
 
-    def _filtered(self, state: SkinState, raw: jax.Array, period: Scalar) -> SkinState:
+    def _filtered(self, state: SkinState, raw: Array, period: Scalar) -> SkinState:
         signal = state.signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - state.signal)
         return state._replace(signal=signal)
 
@@ -345,7 +345,7 @@ def with_contacts(steps: Arrays, shell: Shell, source: str) -> Arrays:
     check_taxels(steps["signal"], shell, source)
     skin = CapacitiveSkin(shell=shell)
 
-    def scan(state: SkinState, row: Pair) -> tuple[SkinState, tuple[jax.Array, ...]]:
+    def scan(state: SkinState, row: Pair) -> tuple[SkinState, tuple[Array, ...]]:
         state, reading = skin.read(state, *row)
         return state, (state.signal, reading.contact_type, reading.p_robot_contact)
 
@@ -386,7 +386,7 @@ def parse_skin(skin: SkinLike) -> Any:
     return changed
 
 
-def _first(excess: jax.Array) -> jax.Array:
+def _first(excess: Array) -> Array:
     """Return the probability (n,) of each entry to be the first active one, if any is active.
 
     Each is active with the probability sigmoid(excess), independently of the others.
@@ -396,7 +396,7 @@ def _first(excess: jax.Array) -> jax.Array:
     return jax.nn.softmax(log_active + jnp.concatenate([jnp.zeros_like(excess[:1]), none_before]))
 
 
-def _extremes(active: jax.Array, values: jax.Array) -> Pair:
+def _extremes(active: Array, values: Array) -> Pair:
     """Return the rows of `values` (n, m) at the first and the last True of `active` (n,)."""
     count = active.shape[0]
     # Minimum and maximum of indices: on a processor `argmax` is twenty times slower.
@@ -406,7 +406,7 @@ def _extremes(active: jax.Array, values: jax.Array) -> Pair:
     return values[first], values[last]
 
 
-def _reading(kind: jax.Array, first: jax.Array, last: jax.Array) -> Reading:
+def _reading(kind: Array, first: Array, last: Array) -> Reading:
     """Return the reading of Sec. II-B: the location is the mean of the extreme positions."""
     location = jnp.where(kind == NONE, 0.0, 0.5 * (first + last))
     return Reading(kind.astype(jnp.int32), location, kind != NONE)

@@ -32,7 +32,7 @@ from rps_jax.engines import device, native
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Pair, Pytree
+from rps_jax.geometry.arrays import Array, Pair, Pytree
 from rps_jax.record.options import check_fields, option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
@@ -71,10 +71,10 @@ class State:
     """State of an environment, with the fields of mujoco_playground's `State`."""
 
     data: Trial  # with qpos (10,), qvel (9,) and the counters of the rules
-    obs: jax.Array  # (44,) see `PushEnv`
-    reward: jax.Array  # () [1]
-    done: jax.Array  # () [1] 0 or 1
-    metrics: dict[str, jax.Array]  # () each
+    obs: Array  # (44,) see `PushEnv`
+    reward: Array  # () [1]
+    done: Array  # () [1] 0 or 1
+    metrics: dict[str, Array]  # () each
     # `world`: the World; `index`: its index in the domain; `observation`: the TaxelObservation.
     info: dict[str, Pytree]
 
@@ -149,7 +149,7 @@ class PushEnv:
     # --- the loop ---
 
     @device.standard_jax()
-    def reset(self, rng: jax.Array) -> State:
+    def reset(self, rng: Array) -> State:
         """Return a random world at its start, from a key."""
         device.check_process()
         try:
@@ -166,7 +166,7 @@ class PushEnv:
         """Worlds of the domain, with leaves (worlds, ...)."""
         return self._batch.worlds
 
-    def begin(self, world: World, index: jax.Array) -> State:
+    def begin(self, world: World, index: Array) -> State:
         """Return the start of the world `index`, or of one derived from it."""
         start = trial.start(world, self.params)
         no_contact = jnp.full_like(start.min_distance, jnp.inf)
@@ -178,7 +178,7 @@ class PushEnv:
         return State(current, _obs(obs), zero, zero, metrics, info)
 
     @device.standard_jax()
-    def step(self, state: State, action: jax.Array) -> State:
+    def step(self, state: State, action: Array) -> State:
         """Run one control period with the base at the twist of an action (3,)."""
         if not isinstance(state, State):
             rule = "give the State that reset returned"
@@ -216,7 +216,7 @@ class PushEnv:
             info=state.info | {"observation": obs},
         )
 
-    def twist(self, action: jax.Array) -> Twist:
+    def twist(self, action: Array) -> Twist:
         """Return the twist [m/s, m/s, rad/s] of an action (3,) or (2,), within the bounds."""
         size = self.action_size
         names = "v_x, v_y and omega" if size == 3 else "v_x and omega"
@@ -274,7 +274,7 @@ class PushEnv:
         touch = measured.observation._replace(period=jnp.asarray(self.dt))
         return features.OBSERVATIONS[self.senses](touch, measured.reading, *skin)
 
-    def has_timed_out(self, data: Trial) -> jax.Array:
+    def has_timed_out(self, data: Trial) -> Array:
         """Return whether trials (...) ended by a time limit, and not by success or failure."""
         rules, lost = self.setting.rules, data.lost_steps * self.dt
         late = (data.steps * self.dt >= rules.horizon) | (lost > rules.max_lost)
@@ -357,7 +357,7 @@ class PushEnv:
         return images
 
 
-def _obs(obs: TaxelObservation | EndsObservation) -> jax.Array:
+def _obs(obs: TaxelObservation | EndsObservation) -> Array:
     """Return the observation (n,) of `PushEnv`."""
     touch = obs.touch
     goal = planar.rotate(-touch.yaw, touch.p_world_target - touch.p_world_robot)
@@ -369,7 +369,7 @@ def _obs(obs: TaxelObservation | EndsObservation) -> jax.Array:
     return jnp.concatenate([x.astype(goal.dtype) for x in parts])
 
 
-def _metrics(current: Trial, measured: Measurement, progress: jax.Array) -> dict[str, jax.Array]:
+def _metrics(current: Trial, measured: Measurement, progress: Array) -> dict[str, Array]:
     flags = {"in_contact": measured.reading.in_contact, "success": current.success}
     flags |= {"diverged": current.diverged}
     return {"progress": progress} | {k: v.astype(progress.dtype) for k, v in flags.items()}

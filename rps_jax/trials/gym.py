@@ -26,6 +26,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.control import soft
 from rps_jax.engines import device
+from rps_jax.geometry.arrays import Array
 from rps_jax.record.files import Arrays
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
 from rps_jax.trials.worlds import rows
@@ -44,17 +45,17 @@ Infos = dict[str, Any]
 _SEEDS = 2**32  # of one word of a key
 
 
-def _hold(env: PushEnv, steps: int, state: State, action: jax.Array) -> tuple[State, jax.Array]:
+def _hold(env: PushEnv, steps: int, state: State, action: Array) -> tuple[State, Array]:
     """Hold an action for `steps` control steps; return the state and the sum of rewards."""
 
-    def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], None]:
+    def step(carry: tuple[State, Array], _: None) -> tuple[tuple[State, Array], None]:
         state = env.step(carry[0], action)
         return (state, carry[1] + state.reward), None
 
     return jax.lax.scan(step, (state, jnp.zeros_like(state.reward)), length=steps)[0]
 
 
-def _restart(env: PushEnv, key: jax.Array) -> tuple[jax.Array, State]:
+def _restart(env: PushEnv, key: Array) -> tuple[Array, State]:
     """Return the random stream after a restart, and the state at the start of its world."""
     key, world_key = jax.random.split(key)
     return key, env.reset(world_key)
@@ -187,7 +188,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, bool)
-        self._keys: jax.Array | None = None  # (num_envs,) random streams of the worlds
+        self._keys: Array | None = None  # (num_envs,) random streams of the worlds
         self._state: State | None = None
         self._start = jax.jit(jax.vmap(partial(_restart, self.push_env)))
         self._act = jax.jit(jax.vmap(partial(_hold, self.push_env, steps)))

@@ -17,6 +17,7 @@ import numpy as np
 
 from rps_jax import engines, errors
 from rps_jax.control.base import LawParams, Memory
+from rps_jax.geometry.arrays import Array
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin, Skin
 from rps_jax.trials import trial
@@ -180,14 +181,14 @@ def yaw_target(worlds: World) -> float | None:
 @partial(jax.vmap, in_axes=(None, None, 0, None))
 def _observe(
     world: World, params: LawParams, trials: Trial, loop: ControlLoop
-) -> tuple[Snapshot, jax.Array, jax.Array]:
+) -> tuple[Snapshot, Array, Array]:
     """Return snapshot, contact point and compression of a world in several states."""
     snapshot = trial.decide(world, params, trials, loop)[2]
     contact = trial.p_world_contact(rows(snapshot, None))[0]
     return snapshot, contact, _compression(world.skin, trial.outline(world, snapshot.qpos))
 
 
-def _compression(skin: Skin, outline: Footprint) -> jax.Array:
+def _compression(skin: Skin, outline: Footprint) -> Array:
     """Return the greatest compression (T,) [1] under each taxel.
 
     The tolerance of an ideal sensor counts as its foam.

@@ -19,14 +19,13 @@ The planner of `rps ceiling` minimises `plan_costs`.
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
 from rps_jax.analysis import statistics
-from rps_jax.geometry.arrays import Number
+from rps_jax.geometry.arrays import Array, Number
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import check_fields, option
 from rps_jax.trials.trial import Outcome, Rules
@@ -76,7 +75,7 @@ class Objective:
         missed = statistics.miss_distance(outcome.min_distance, distance)
         return np.asarray(self.score(success, time, lost, missed, rules), float)
 
-    def value(self, scores: ArrayLike) -> jax.Array:
+    def value(self, scores: ArrayLike) -> Array:
         """Return the mean (...) of scores (..., W) over their worlds."""
         return jnp.mean(jnp.asarray(scores), axis=-1)
 

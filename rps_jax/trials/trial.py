@@ -112,7 +112,7 @@ class World(NamedTuple):
     p_world_target: Float[Array, "*B 2"]  # [m]
     shift: Shift
     qpos: Float[Array, "*B 10"]  # at the start, as in `Trial`
-    key: jax.Array  # of the imperfections of skin and odometry
+    key: Array  # of the imperfections of skin and odometry
     odometry: Odometry = Odometry()
     robot: Robot | None = None  # with limits; None follows every twist
     task: Pytree = reach.Nothing()  # a `Course`
@@ -603,9 +603,7 @@ _UNCHECKED = 20  # control steps on a GPU before the host checks whether any tri
 Batch = tuple[Stage, World, LawParams, Trial]
 
 
-def advance(
-    batches: Sequence[Batch], loop: ControlLoop, steps: int | jax.Array
-) -> tuple[Trial, ...]:
+def advance(batches: Sequence[Batch], loop: ControlLoop, steps: int | Array) -> tuple[Trial, ...]:
     """Run up to `steps` control steps of batches side by side; fewer if all trials end.
 
     Every batch has its own stage and shape family. The number of steps is no part of the program,
@@ -616,12 +614,12 @@ def advance(
         return _advance_in_xla(batches, loop, steps)
 
     def single(
-        stage: Stage, world: World, params: LawParams, trial: Trial, rules: Pytree, steps: jax.Array
+        stage: Stage, world: World, params: LawParams, trial: Trial, rules: Pytree, steps: Array
     ) -> Trial:
         """Advance one world."""
         world_loop = dataclasses.replace(loop, rules=rules)
 
-        def step(carry: tuple[int | jax.Array, Trial]) -> tuple[int | jax.Array, Trial]:
+        def step(carry: tuple[int | Array, Trial]) -> tuple[int | Array, Trial]:
             count, trial = carry
             inputs = stage, world, params, trial, world_loop
             return count + 1, control_step(*inputs, mapped=lambda f, *_: f)[0]
@@ -636,7 +634,7 @@ def advance(
         shared, pairs = dataclasses.replace(loop, rules=rules), zip(stages, inputs, strict=True)
         return _advance_in_xla([(stage, *values[:-2]) for stage, values in pairs], shared, steps)
 
-    def phase(world: World, params: LawParams, trial: Trial, *_: Pytree) -> jax.Array:
+    def phase(world: World, params: LawParams, trial: Trial, *_: Pytree) -> Array:
         """Return 0 for trials that push, 1 for those before the first touch, above for ended."""
         return 2 * trial.done + (trial.contact_steps == 0)
 
@@ -670,10 +668,10 @@ def segment_of(
         stages: tuple[Stage, ...],
         inputs: tuple[tuple[World, LawParams], ...],
         trials: tuple[Trial, ...],
-        fresh: tuple[jax.Array, ...],
-        live: tuple[jax.Array, ...],
+        fresh: tuple[Array, ...],
+        live: tuple[Array, ...],
         rules: Rules,
-        steps: jax.Array,
+        steps: Array,
     ) -> tuple[tuple[Trial, ...], tuple[SegmentState, ...]]:
         pairs = zip(inputs, live, strict=True)
         started = [start_all(*leaves, mask, law=law) for leaves, mask in pairs]
@@ -691,7 +689,7 @@ def segment_of(
 
 
 def _advance_in_xla(
-    batches: Sequence[Batch], loop: ControlLoop, steps: int | jax.Array
+    batches: Sequence[Batch], loop: ControlLoop, steps: int | Array
 ) -> tuple[Trial, ...]:
     """Run `advance` as a program of XLA."""
 

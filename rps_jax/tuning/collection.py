@@ -27,7 +27,7 @@ from rps_jax.control.learned.network import Network, PolicyState, Weights
 from rps_jax.engines import native
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Pair
+from rps_jax.geometry.arrays import Array, Pair
 from rps_jax.trials import trial
 from rps_jax.trials.env import PushEnv, State
 from rps_jax.trials.trial import World
@@ -38,7 +38,7 @@ from rps_jax.world.scene import JOINTS
 from rps_jax.world.tasks.reach import Nothing
 
 T = TypeVar("T")
-ActCarry = tuple[State, TouchState, jax.Array]  # state, touch state, reward ()
+ActCarry = tuple[State, TouchState, Array]  # state, touch state, reward ()
 _RADIUS = 0.3  # [m] unit of the circumradius
 _TILT_SCALE = 6.0  # of half of the components of the object's axis
 _FAILURE_DECAY = 0.7  # of a world's failure rate, per trial in it
@@ -50,27 +50,27 @@ class EnvBatch(NamedTuple):
 
     states: State
     memory: PolicyState
-    first: jax.Array  # (N,) bool: the trial has just started
-    earned: jax.Array  # (N,) [1] rewards of the trial so far
+    first: Array  # (N,) bool: the trial has just started
+    earned: Array  # (N,) [1] rewards of the trial so far
 
 
-Carry = tuple[tuple[EnvBatch, ...], jax.Array]  # batches and key, between two actions
-Stats = dict[str, jax.Array]  # counts of ended trials, of worlds (N,) or sums over them, by name
+Carry = tuple[tuple[EnvBatch, ...], Array]  # batches and key, between two actions
+Stats = dict[str, Array]  # counts of ended trials, of worlds (N,) or sums over them, by name
 # Transitions, inputs of the network after the action, statistics, and indices of the worlds.
-StepResults = tuple[Transition, Pair, Stats, jax.Array]
+StepResults = tuple[Transition, Pair, Stats, Array]
 
 
 class RunnerState(NamedTuple):
     """State of a learning run between two updates."""
 
     train: TrainState
-    progress: jax.Array  # () [1] share of the run that is over
-    updates: jax.Array  # () number of updates
-    failures: tuple[jax.Array, ...]  # (worlds,) [1] recent failure rates of each table's worlds
-    level: jax.Array  # () [1] of the curriculum
-    ended: jax.Array  # () trials that ended, with exponentially decaying weights
-    succeeded: jax.Array  # () successes, with the same weights
-    key: jax.Array
+    progress: Array  # () [1] share of the run that is over
+    updates: Array  # () number of updates
+    failures: tuple[Array, ...]  # (worlds,) [1] recent failure rates of each table's worlds
+    level: Array  # () [1] of the curriculum
+    ended: Array  # () trials that ended, with exponentially decaying weights
+    succeeded: Array  # () successes, with the same weights
+    key: Array
     batches: tuple[EnvBatch, ...]
 
 
@@ -106,7 +106,7 @@ def start(
     return RunnerState(*inputs, tuple(batches))
 
 
-def ease(world: World, level: jax.Array) -> World:
+def ease(world: World, level: Array) -> World:
     """Return a world with a nearer target, more ahead; unchanged at level 1, or with a path."""
     if not isinstance(world.task, Nothing):
         return world
@@ -138,14 +138,14 @@ def _together(
 
 
 def _begin(
-    network: Network, envs: Sequence[PushEnv], draws: Sequence[tuple[World, jax.Array]]
+    network: Network, envs: Sequence[PushEnv], draws: Sequence[tuple[World, Array]]
 ) -> list[EnvBatch]:
     """Return worlds (N, ...) of indices (N,) at their start, after the first observation."""
     batches = _together(envs, network, _begin_world, draws)
     return [_with_info(x, world=draw[0]) for x, draw in zip(batches, draws, strict=True)]
 
 
-def _begin_world(network: Network, env: PushEnv, world: World, index: jax.Array) -> EnvBatch:
+def _begin_world(network: Network, env: PushEnv, world: World, index: Array) -> EnvBatch:
     """Return one world at its start, without the fields that do not change."""
     state = env.begin(world, index)
     memory = PolicyState.init(network, state.obs.dtype)
@@ -160,12 +160,10 @@ def _with_info(batch: EnvBatch, **info: PyTree) -> EnvBatch:
     return batch._replace(states=batch.states.replace(info=batch.states.info | info))
 
 
-def _draw_worlds(
-    table: World, level: jax.Array, key: jax.Array, indices: jax.Array
-) -> tuple[World, jax.Array]:
+def _draw_worlds(table: World, level: Array, key: Array, indices: Array) -> tuple[World, Array]:
     """Return the worlds of indices (N,), and these; one in five has a random lower level."""
 
-    def draw_world(key: jax.Array, index: jax.Array) -> World:
+    def draw_world(key: Array, index: Array) -> World:
         noise_key, level_key = jax.random.split(key)
         u = jax.random.uniform(level_key)
         world_level = jnp.where((u < 0.2) & (level < 1), 5 * u, 1.0) * level
@@ -175,9 +173,7 @@ def _draw_worlds(
     return jax.vmap(draw_world)(jax.random.split(key, indices.size), indices), indices
 
 
-def draw_indices(
-    ppo: PPO, failures: jax.Array, key: jax.Array, shape: tuple[int, ...]
-) -> jax.Array:
+def draw_indices(ppo: PPO, failures: Array, key: Array, shape: tuple[int, ...]) -> Array:
     """Return random indices of worlds; a share of them, `ppo.prioritised`, by their failure rates.
 
     The weight of a world is greatest where it sometimes fails; it is small where it always does.
@@ -193,9 +189,7 @@ def draw_indices(
     return jnp.where(chosen, prioritised, indices)
 
 
-def failure_rates(
-    rates: jax.Array, index: jax.Array, ended: jax.Array, succeeded: jax.Array
-) -> jax.Array:
+def failure_rates(rates: Array, index: Array, ended: Array, succeeded: Array) -> Array:
     """Return the failure rates (worlds,) after trials (...), of which some have ended."""
     change = (1 - _FAILURE_DECAY) * ended * (1 - succeeded - rates[index])
     return jnp.clip(rates.at[index].add(change), 0, 1)
@@ -233,8 +227,8 @@ def _inputs(env: PushEnv, batch: EnvBatch) -> Pair:
 
 
 def _act(
-    network: Network, env: PushEnv, batch: EnvBatch, _: jax.Array, action: jax.Array
-) -> tuple[EnvBatch, jax.Array]:
+    network: Network, env: PushEnv, batch: EnvBatch, _: Array, action: Array
+) -> tuple[EnvBatch, Array]:
     """Execute an action (A,) in one world; the kernel does not copy constant fields."""
     bounded = features.clip_action(action)
     command = bounded if network.actions == 3 else bounded[::2]  # v_x and omega
@@ -258,9 +252,9 @@ def _act_together(
     envs: Sequence[PushEnv],
     network: Network,
     batches: Sequence[EnvBatch],
-    hidden: jax.Array,
-    action: jax.Array,
-) -> list[tuple[EnvBatch, jax.Array]]:
+    hidden: Array,
+    action: Array,
+) -> list[tuple[EnvBatch, Array]]:
     """Execute the joined actions (sum of N, A) in the worlds of all environments.
 
     Returns:
@@ -278,7 +272,7 @@ def _act_together(
     return results
 
 
-def _episode_stats(env: PushEnv, batch: EnvBatch) -> tuple[Stats, jax.Array]:
+def _episode_stats(env: PushEnv, batch: EnvBatch) -> tuple[Stats, Array]:
     """Return statistics of the trials that have ended, and whether each is terminated (N,).
 
     A trial that reached a time limit, with or without contact, is truncated and not terminated,
@@ -308,7 +302,7 @@ def update(
     envs: Sequence[PushEnv],
     tables: Sequence[World],
     runner: RunnerState,
-) -> tuple[RunnerState, dict[str, jax.Array]]:
+) -> tuple[RunnerState, dict[str, Array]]:
     """Make one update; return the next state and the update's metrics () for the curve.
 
     Each of `envs` has one shape of object and one domain. Their worlds, `tables`, are inputs and
@@ -322,7 +316,7 @@ def update(
     pairs = zip(runner.failures, index_keys, strict=True)
     indices = tuple(draw_indices(ppo, *pair, shape) for pair in pairs)
 
-    def take_action(carry: Carry, fresh: tuple[jax.Array, ...]) -> tuple[Carry, StepResults]:
+    def take_action(carry: Carry, fresh: tuple[Array, ...]) -> tuple[Carry, StepResults]:
         """Take one action in all worlds, and restart those whose trials end."""
         batches, key = carry
         key, noise_key, *start_keys = jax.random.split(key, 2 + len(envs))
@@ -402,7 +396,7 @@ def run_policy(
         actions = network.apply(actor, hidden, _join(inputs))
         return [x for x, _ in _act_together(envs, network, batches, *actions)]
 
-    def is_running(batches: list[EnvBatch]) -> jax.Array:
+    def is_running(batches: list[EnvBatch]) -> Array:
         return ~jnp.all(_join([x.states.data.done for x in batches]))
 
     batches = jax.lax.while_loop(is_running, step, _begin(network, envs, draws))

@@ -61,7 +61,7 @@ from rps_jax.world.tasks import TaskLike
 
 Score = Callable[..., Any]  # of a trajectory (T, ...) of one world, and other arguments
 ScoreLike = Score | Objective
-Scored = tuple[jax.Array, PyTree]  # scores, and auxiliary outputs
+Scored = tuple[Array, PyTree]  # scores, and auxiliary outputs
 _STEP = 1e-6  # of differences, relative to a quantity
 _SMALLEST = 0.01  # in its unit, below which the step is not relative
 _NOISE = 1e-12  # relative change of a number of a world that is rounding
@@ -412,13 +412,13 @@ class Trajectory(NamedTuple):
     state: Trial | None = None  # (T, ...) after each step, with `states`
 
     @property
-    def executed(self) -> jax.Array:
+    def executed(self) -> Array:
         """Twists (T, 3) [m/s, m/s, rad/s] of the base, robot frame."""
         qvel, yaw = self._state.qvel, self._state.qpos[:, 2]
         return jnp.concatenate([planar.rotate(-yaw, qvel[:, :2]), qvel[:, 2:3]], axis=1)
 
     @property
-    def force(self) -> jax.Array:
+    def force(self) -> Array:
         """Wrenches (T, 3) [N, N, N m] of the object on the base, about its origin, robot frame.
 
         They are means over a control period.
@@ -452,7 +452,7 @@ def _value_and_slopes(
     loop: ControlLoop,
     options: _Options,
     args: tuple[PyTree, ...],
-) -> tuple[Scored, dict[str, jax.Array]]:
+) -> tuple[Scored, dict[str, Array]]:
     """Return the scores (n,) of worlds and laws, and their derivatives (n, ...) by some leaves.
 
     Auxiliary outputs (n, ...) come with the scores.
@@ -550,7 +550,7 @@ def soft_score(
     setting: Setting,
     objective: Objective,
     arrive: float = 0.005,
-) -> jax.Array:
+) -> Array:
     """Return the objective's score () of the snapshots (T, ...) of a softened window.
 
     The base arrives at a step by a weight: in contact, and nearer than d_success within the
@@ -567,10 +567,10 @@ def soft_score(
 def soft_times(
     snapshots: Snapshot | Trajectory,
     d_success: Number,
-    touched: jax.Array | bool = False,
+    touched: Array | bool = False,
     live: Number = 1.0,
     arrive: float = 0.005,
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[Array, Array]:
     """Return the weights (T,) of the steps before the arrival, and the steps () without contact.
 
     `touched` says whether the object was touched before the snapshots, and `live` (T,) is 0 where

@@ -35,7 +35,7 @@ from rps_jax.control.base import LawParams
 from rps_jax.engines import native
 from rps_jax.engines.base import Stage
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Number
+from rps_jax.geometry.arrays import Array, Number
 from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
 from rps_jax.trials import trial
@@ -190,7 +190,7 @@ class TuneGrad(Descent):
         return {**results, **gradient_results(followed), **more, **times}
 
     def _check(
-        self, proposal: Proposal, generation: int, score: ScoreCandidates, gradient: jax.Array
+        self, proposal: Proposal, generation: int, score: ScoreCandidates, gradient: Array
     ) -> tuple[Results, dict[str, float]]:
         """Validate, and measure the slope of whole trials along a gradient (p,)."""
         vector, way = jnp.asarray(proposal["vectors"][0]), jnp.nan_to_num(gradient)
@@ -234,7 +234,7 @@ class TuneGrad(Descent):
 
     def _derivatives(
         self,
-        vector: jax.Array,
+        vector: Array,
         states: list[_States],
         coefficients: np.ndarray,
         generation: int,
@@ -286,8 +286,8 @@ class _States(NamedTuple):
 
 
 def _run_trials(
-    options: TuneGrad, vector: jax.Array, stage: Stage, worlds: World, soft: World
-) -> tuple[Trial, jax.Array, jax.Array, jax.Array]:
+    options: TuneGrad, vector: Array, stage: Stage, worlds: World, soft: World
+) -> tuple[Trial, Array, Array, Array]:
     """Run trials of the original law.
 
     Returns:
@@ -319,9 +319,9 @@ def _run_trials(
 
 
 def _differentiate(
-    options: TuneGrad, vector: jax.Array, coefficients: jax.Array, stage: Stage, worlds: World,
-    trials: Trial, at: jax.Array,
-) -> jax.Array:  # fmt: skip
+    options: TuneGrad, vector: Array, coefficients: Array, stage: Stage, worlds: World,
+    trials: Trial, at: Array,
+) -> Array:  # fmt: skip
     """Return the derivatives (m, p) of the scores of windows from the states `at` (m, 2)."""
     setting, objective = options.setting, options.objective
     # A law without a smooth form has the derivatives between its switches.
@@ -336,7 +336,7 @@ def _differentiate(
 
     def cost(
         snapshots: Snapshot, world: World, params: LawParams, first: Trial, last: Trial
-    ) -> jax.Array:
+    ) -> Array:
         weights = first.contact_steps > 0, 1 - snapshots.done
         under_way, lost = soft_times(snapshots, params.d_success, *weights)
         rest = jnp.dot(coefficients[1:], features(world, params, last, loop)) + coefficients[0]
@@ -344,7 +344,7 @@ def _differentiate(
         whole = objective.score(1.0, *times, 0.0, rules)
         return jnp.asarray(whole + under_way[-1] * jnp.where(last.done, 1.0 - last.success, rest))
 
-    def total(thetas: jax.Array) -> jax.Array:
+    def total(thetas: Array) -> Array:
         params = jax.vmap(options.space.params)(thetas)
         steps = max(1, round(options.window / period))
         last, snapshots = trial.unroll(stage, worlds, params, states, loop, steps, native.mapped)
@@ -361,7 +361,7 @@ _NUM_FEATURES = 6
 _REMEMBERED = 0.75  # [1] weight of former trials at each refresh
 
 
-def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -> jax.Array:
+def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -> Array:
     """Return the physical features (F,) of a state, which are equal for mirrored worlds.
 
     The first is whether there is contact. The others are of the distance from contact to target,

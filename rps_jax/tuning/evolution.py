@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from rps_jax.geometry.arrays import Array
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs.evaluate import Candidates, CandidateScores
@@ -41,13 +42,13 @@ class Descent(Tuning):
     pairs: int = option(1, 1, 1_000_000)
     """Number of antithetic pairs of random steps in each world."""
 
-    def tried(self, vectors: jax.Array, generation: int, worlds: int) -> Candidates:
+    def tried(self, vectors: Array, generation: int, worlds: int) -> Candidates:
         """Return the vectors (P, p) as candidates in the first worlds of a generation."""
         candidates = self.candidates(self.space.params(vectors), generation)
         return replace(candidates, worlds=candidates.worlds[0] + np.arange(worlds))
 
     def antithetic(
-        self, vector: jax.Array, generation: int, worlds: int
+        self, vector: Array, generation: int, worlds: int
     ) -> tuple[Candidates, Callable[[CandidateScores], Estimate]]:
         """Return random steps from a vector (p,) as candidates, and the estimator of their slopes.
 
@@ -135,7 +136,7 @@ class Descent(Tuning):
         }
 
 
-def gradient_results(estimate: Estimate) -> dict[str, jax.Array]:
+def gradient_results(estimate: Estimate) -> dict[str, Array]:
     """Return the results of a step for the gradient (p,) that it follows."""
     return {
         "gradients": estimate.gradient[None],

@@ -36,6 +36,7 @@ from rps_jax.control.registry import LawLike
 from rps_jax.engines import device
 from rps_jax.engines.base import Stage
 from rps_jax.errors import InputError
+from rps_jax.geometry.arrays import Array
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
 from rps_jax.record.files import Arrays, JsonObject
@@ -354,11 +355,11 @@ def check_law(label: str, law: Law, setting: Setting) -> None:
 @partial(jax.jit, static_argnames=("rows", "row_steps"))
 def _simulate_logs(
     stage: Stage, worlds: World, params: LawParams, loop: ControlLoop, *, rows: int, row_steps: int
-) -> dict[str, jax.Array]:
+) -> dict[str, Array]:
     """Return the logs of a batch, (rows, B, ...), with one row every `row_steps` control steps."""
     control_step = partial(trial.control_step, stage, worlds, params, loop=loop)
 
-    def row(trials: Trial, _: None) -> tuple[Trial, dict[str, jax.Array]]:
+    def row(trials: Trial, _: None) -> tuple[Trial, dict[str, Array]]:
         trials, snapshot = control_step(trials)
         trials = jax.lax.fori_loop(1, row_steps, lambda _, t: control_step(t)[0], trials)
         obs = snapshot.details[1]  # of `recorded_law`

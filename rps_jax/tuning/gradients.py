@@ -17,25 +17,27 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-Scores = Callable[[jax.Array, PyTree], jax.Array]
+from rps_jax.geometry.arrays import Array
+
+Scores = Callable[[Array, PyTree], Array]
 
 
 class Estimate(NamedTuple):
     """Gradient as the mean of independent samples, with its variance."""
 
-    gradient: jax.Array  # (p, ...) NaN where no sample is finite
-    variance: jax.Array  # (p, ...) of the mean; inf for fewer than two samples
-    finite: jax.Array  # (p, ...) [1] share of the samples that are finite and used
+    gradient: Array  # (p, ...) NaN where no sample is finite
+    variance: Array  # (p, ...) of the mean; inf for fewer than two samples
+    finite: Array  # (p, ...) [1] share of the samples that are finite and used
 
 
 class Options(NamedTuple):
     """Options of `evolution`."""
 
-    sigma: float | jax.Array = 0.15  # () or (p,) standard deviation of the steps, in theta's units
+    sigma: float | Array = 0.15  # () or (p,) standard deviation of the steps, in theta's units
     pairs: int = 1  # antithetic pairs of steps in each world
 
 
-def estimate(samples: jax.Array) -> Estimate:
+def estimate(samples: Array) -> Estimate:
     """Return the mean of the finite entries of samples (n, p, ...), with its variance."""
     is_finite = jnp.isfinite(samples)
     samples = jnp.where(is_finite, samples, 0.0)
@@ -46,7 +48,7 @@ def estimate(samples: jax.Array) -> Estimate:
     return Estimate(mean, jnp.where(count > 1, variance, jnp.inf), count / len(samples))
 
 
-def clip(samples: jax.Array, bound: float) -> jax.Array:
+def clip(samples: Array, bound: float) -> Array:
     """Scale samples (n, p, ...) whose norm over p exceeds `bound` times the median norm down to it.
 
     This biases the mean but keeps a few samples from dominating it. Samples of norm 0 do not count.
@@ -60,14 +62,14 @@ def clip(samples: jax.Array, bound: float) -> jax.Array:
     return samples * jnp.where(size == 0, 1.0, jnp.minimum(1.0, limit / size))
 
 
-def cosine(a: jax.Array, b: jax.Array) -> jax.Array:
+def cosine(a: Array, b: Array) -> Array:
     """Return the cosine of the angle between two vectors (p,); NaN if one is zero."""
     return jnp.dot(a, b) / (jnp.linalg.norm(a) * jnp.linalg.norm(b))
 
 
 def evolution(
-    scores: Scores, theta: jax.Array, worlds: PyTree, key: jax.Array, options: Options = Options()
-) -> jax.Array:
+    scores: Scores, theta: Array, worlds: PyTree, key: Array, options: Options = Options()
+) -> Array:
     """Return slopes of the smoothed score along antithetic random steps, without derivatives.
 
     Each world tries random normal directions and their opposites. The mean is unbiased for the
@@ -81,8 +83,8 @@ def evolution(
 
 
 def random_steps(
-    theta: jax.Array, worlds: PyTree, key: jax.Array, options: Options
-) -> tuple[jax.Array, jax.Array, PyTree]:
+    theta: Array, worlds: PyTree, key: Array, options: Options
+) -> tuple[Array, Array, PyTree]:
     """Return normal directions (pairs, n, p), and thetas and worlds (2 pairs n, ...) along them.
 
     The first half of these are steps ahead, the second half the opposite ones.
@@ -97,7 +99,7 @@ def random_steps(
     )
 
 
-def slopes_along(directions: jax.Array, values: jax.Array, options: Options) -> jax.Array:
+def slopes_along(directions: Array, values: Array, options: Options) -> Array:
     """Return the slopes (n, p, ...) of the scores (2 pairs n, ...) of `random_steps`."""
     values = values.reshape(2, options.pairs, -1, 1, *values.shape[1:])
     along = directions / (2 * options.sigma)
@@ -105,7 +107,7 @@ def slopes_along(directions: jax.Array, values: jax.Array, options: Options) -> 
     return jnp.mean((values[0] - values[1]) * along, axis=0)
 
 
-def per_world(theta: jax.Array, worlds: PyTree) -> jax.Array:
+def per_world(theta: Array, worlds: PyTree) -> Array:
     """Return theta, (p,) or (n, p), for each world, (n, p)."""
     count = jax.tree.leaves(worlds)[0].shape[0]
     return jnp.broadcast_to(theta, (count, theta.shape[-1]))

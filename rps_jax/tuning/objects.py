@@ -29,7 +29,7 @@ from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.engines import finger
 from rps_jax.geometry import planar, polyline, solid
-from rps_jax.geometry.arrays import Pair
+from rps_jax.geometry.arrays import Array, Pair
 from rps_jax.record import table
 from rps_jax.record.options import option
 from rps_jax.runs.question import Question, Rows, Run, call_of
@@ -147,7 +147,7 @@ def read_pushes(pushes: PushesLike) -> Pushes:
     return Pushes(np.array(path), *(np.array([x[i, 2:5] for x in parts]) for i in (0, -1)))
 
 
-def _pressure(theta: Mapping[str, jax.Array], pads: np.ndarray) -> jax.Array:
+def _pressure(theta: Mapping[str, Array], pads: np.ndarray) -> Array:
     """Return the shares (S,) of the load of pads of equal density."""
     at, load = pads[:, :2], pads[:, 2]
     at = at - load @ at
@@ -164,12 +164,12 @@ def _pressure(theta: Mapping[str, jax.Array], pads: np.ndarray) -> jax.Array:
     return share / share.sum()
 
 
-def _slider(x: jax.Array, outline: np.ndarray, pads: np.ndarray, radius: float) -> Any:
+def _slider(x: Array, outline: np.ndarray, pads: np.ndarray, radius: float) -> Any:
     """Return the object that parameters describe, and the offset (2,) [m] of the camera."""
     theta = dict(zip(PRIOR, x, strict=True))
     size, shift = 1 + theta["size"], jnp.stack([theta["marker_x"], theta["marker_y"]])
 
-    def placed(points: np.ndarray) -> jax.Array:
+    def placed(points: np.ndarray) -> Array:
         return planar.rotate(theta["marker_yaw"], size * points) + shift
 
     support = jnp.column_stack([placed(pads[:, :2]), _pressure(theta, pads), pads[:, 3]])
@@ -179,9 +179,7 @@ def _slider(x: jax.Array, outline: np.ndarray, pads: np.ndarray, radius: float) 
 
 
 @jax.jit
-def _simulate(
-    x: jax.Array, fixed: tuple, path: jax.Array, start: jax.Array, end: jax.Array
-) -> Pair:
+def _simulate(x: Array, fixed: tuple, path: Array, start: Array, end: Array) -> Pair:
     """Return final poses (n, 3) and gaps (n, 3) [m].
 
     These are at measured starts, if negative; at measured ends, if the finger still touches there;

@@ -16,7 +16,7 @@ import numpy as np
 import optax
 from jaxtyping import PyTree
 
-from rps_jax.geometry.arrays import Pair
+from rps_jax.geometry.arrays import Array, Pair
 
 BINS = 24  # of each coordinate
 _WIDTH = 96
@@ -45,10 +45,10 @@ class Posterior(NamedTuple):
         return np.clip(np.nan_to_num((statistics - self.mean) / self.scale), -6, 6)
 
 
-def _init(key: jax.Array, features: int, size: int) -> Params:
+def _init(key: Array, features: int, size: int) -> Params:
     """Return random weights of a network for `size` coordinates."""
 
-    def layer(key: jax.Array, fan: int, *shape: int) -> jax.Array:
+    def layer(key: Array, fan: int, *shape: int) -> Array:
         return jax.random.normal(key, shape) / np.sqrt(fan)
 
     keys, w, h = jax.random.split(key, 5), _WIDTH, _WIDTH // 2
@@ -63,7 +63,7 @@ def _init(key: jax.Array, features: int, size: int) -> Params:
     }
 
 
-def _trunk(params: Params, x: jax.Array) -> jax.Array:
+def _trunk(params: Params, x: Array) -> Array:
     """Return the hidden units (n, W) of inputs (n, F)."""
     for w, b in params["trunk"]:
         x = jax.nn.silu(x @ w + b)
@@ -75,7 +75,7 @@ def _mask(size: int) -> np.ndarray:
     return np.triu(np.ones((size, size), np.float32), 1)[..., None]
 
 
-def _loss(params: Params, x: jax.Array, u: jax.Array, key: jax.Array | None = None) -> jax.Array:
+def _loss(params: Params, x: Array, u: Array, key: Array | None = None) -> Array:
     """Return the mean negative log density of u (n, D), relative to the prior."""
     if key is not None:  # noise against overfitting
         x = x + _NOISE * jax.random.normal(key, x.shape)
@@ -110,7 +110,7 @@ def train(u: np.ndarray, statistics: np.ndarray, seed: int = 0) -> Posterior:
     init = partial(_init, features=features, size=u.shape[-1])
 
     @jax.jit
-    def epoch(carry: Carry, key: jax.Array) -> tuple[Carry, jax.Array]:
+    def epoch(carry: Carry, key: Array) -> tuple[Carry, Array]:
         def update(carry: Carry, step: Pair) -> tuple[Carry, None]:
             (params, state), (rows, key) = carry, step
             grad = jax.grad(_loss)(params, inputs[rows], targets[rows], key)
@@ -148,14 +148,14 @@ def sample(posterior: Posterior, statistics: np.ndarray, count: int, seed: int =
 
 
 @partial(jax.jit, static_argnames="count")
-def _draw(params: Params, x: jax.Array, key: jax.Array, count: int) -> jax.Array:
+def _draw(params: Params, x: Array, key: Array, count: int) -> Array:
     """Draw points (count, D) of the posterior of the inputs (m, F)."""
     units = jax.vmap(_trunk, (0, None))(params, x)  # (members, m, W)
     power = (1 + _NEXT_WEIGHT * (len(x) - 1)) / len(x)  # of each density in the product
     size = params["bias"].shape[1]
     previous = params["previous"] * _mask(size)
 
-    def draw_coordinate(d: jax.Array, carry: Pair) -> Pair:
+    def draw_coordinate(d: Array, carry: Pair) -> Pair:
         u, key = carry
         key, key_bin, key_value, key_rows = jax.random.split(key, 4)
         known = jnp.einsum("cj,ejh->ech", 2 * u - 1, previous[:, :, d]) + params["bias"][:, None, d]

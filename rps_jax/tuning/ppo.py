@@ -21,26 +21,26 @@ from rps_jax.control.learned import features
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import Network, NetworkKind, Weights
 from rps_jax.control.learned.policy import read
-from rps_jax.geometry.arrays import Pair
+from rps_jax.geometry.arrays import Array, Pair
 from rps_jax.record.options import option
 
 _LOG_STD = (-2.5, 0.5)  # bounds on the log standard deviation of an action
 _CRITIC_RATE = 1e-3  # learning rate while the value function alone is learned
-UpdateCarry = tuple[Weights, optax.OptState, jax.Array]  # weights, optimiser, learning rate
+UpdateCarry = tuple[Weights, optax.OptState, Array]  # weights, optimiser, learning rate
 
 
 class Privileged(NamedTuple):
     """Inputs of the value function that the law cannot observe; all are ()."""
 
-    ahead: jax.Array  # [m] of the object in the robot frame, within 3 m
-    left: jax.Array  # [m]
-    radius: jax.Array  # [0.3 m] circumradius of the object
-    remaining: jax.Array  # [1] share of the horizon
-    lost: jax.Array  # [1] time without contact, as a share of what the rules allow
-    tilt_ahead: jax.Array  # [1] of the object's axis, three times its component
-    tilt_left: jax.Array  # [1]
-    height: jax.Array  # [m] of the object's centre at the start
-    room: jax.Array  # [m] between base or object and the nearest wall, within 1 m
+    ahead: Array  # [m] of the object in the robot frame, within 3 m
+    left: Array  # [m]
+    radius: Array  # [0.3 m] circumradius of the object
+    remaining: Array  # [1] share of the horizon
+    lost: Array  # [1] time without contact, as a share of what the rules allow
+    tilt_ahead: Array  # [1] of the object's axis, three times its component
+    tilt_left: Array  # [1]
+    height: Array  # [m] of the object's centre at the start
+    room: Array  # [m] between base or object and the nearest wall, within 1 m
 
 
 _MIRRORED = ("left", "tilt_left")  # they change their signs in the mirror image
@@ -108,7 +108,7 @@ class PPO:
         """Lambda of generalised advantage estimation [1]."""
         return math.exp(-self.hold / self.gae_time)
 
-    def schedule(self, progress: jax.Array, updates: jax.Array) -> Pair:
+    def schedule(self, progress: Array, updates: Array) -> Pair:
         """Return the factor () of annealed options, after a share of the run, and whether the
         policy is frozen () bool, after a number of updates."""
         factor = jnp.clip((1 - progress) / max(self.anneal, 1e-6), 0.05, 1)
@@ -121,10 +121,10 @@ class TrainState(NamedTuple):
     weights: Weights  # "actor", "critic", and "log_std" (A,) of the actions
     ema: Weights  # "actor" averaged over the last updates, which is the law
     optimiser: optax.OptState
-    learning_rate: jax.Array  # ()
+    learning_rate: Array  # ()
 
     @classmethod
-    def init(cls, ppo: PPO, network: Network, key: jax.Array) -> TrainState:
+    def init(cls, ppo: PPO, network: Network, key: Array) -> TrainState:
         """State before the first update."""
         actor, critic = jax.random.split(key)
         inputs = features.feature_count(network.taxels) + PRIVILEGED_SIGNS.size
@@ -140,22 +140,22 @@ class TrainState(NamedTuple):
 class Transition(NamedTuple):
     """Transitions of N worlds in T actions; leaves (T, N, ...)."""
 
-    obs: jax.Array  # (F,) inputs of the network
-    privileged: jax.Array  # (P,) inputs of the value function alone
-    first: jax.Array  # () bool: first of its trial
-    action: jax.Array  # (A,) [1] unbounded
-    log_prob: jax.Array  # ()
-    value: jax.Array  # () before the action
-    next_value: jax.Array  # () after the action, before a restart of the world
-    reward: jax.Array  # ()
-    done: jax.Array  # () bool: terminated or truncated
-    terminated: jax.Array  # () bool: ended with no later reward, as after a success
+    obs: Array  # (F,) inputs of the network
+    privileged: Array  # (P,) inputs of the value function alone
+    first: Array  # () bool: first of its trial
+    action: Array  # (A,) [1] unbounded
+    log_prob: Array  # ()
+    value: Array  # () before the action
+    next_value: Array  # () after the action, before a restart of the world
+    reward: Array  # ()
+    done: Array  # () bool: terminated or truncated
+    terminated: Array  # () bool: ended with no later reward, as after a success
 
 
 # --- the algorithm -------------------------------------------------------------------------
 
 
-def advantages(steps: Transition, gamma: float, gae_lambda: float) -> jax.Array:
+def advantages(steps: Transition, gamma: float, gae_lambda: float) -> Array:
     """Return generalised advantage estimates (T, N) (Schulman et al. 2016, Eq. 16).
 
     A truncated trial, which reached a time limit, is continued by the value function.
@@ -163,7 +163,7 @@ def advantages(steps: Transition, gamma: float, gae_lambda: float) -> jax.Array:
     next_value = jnp.where(steps.terminated, 0.0, steps.next_value)
     delta = steps.reward + gamma * next_value - steps.value
 
-    def backward(later: jax.Array, step: Pair) -> Pair:
+    def backward(later: Array, step: Pair) -> Pair:
         delta, done = step
         advantage = delta + gamma * gae_lambda * jnp.where(done, 0.0, later)
         return advantage, advantage
@@ -171,31 +171,31 @@ def advantages(steps: Transition, gamma: float, gae_lambda: float) -> jax.Array:
     return jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, steps.done), reverse=True)[1]
 
 
-def critic_inputs(obs: jax.Array, privileged: jax.Array) -> jax.Array:
+def critic_inputs(obs: Array, privileged: Array) -> Array:
     """Return inputs (..., 2, F + P) of the value function, for the world and its mirror image."""
     signs = jnp.asarray(PRIVILEGED_SIGNS, privileged.dtype)
     both = jnp.stack([privileged, signs * privileged], axis=-2)
     return jnp.concatenate([networks.mirror_pairs(obs), both], axis=-1)
 
 
-def log_prob(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
+def log_prob(action: Array, mean: Array, log_std: Array) -> Array:
     """Return the log density (...) of actions (..., A) [1], independent and normal."""
     z = (action - mean) / jnp.exp(log_std)
     return jnp.sum(-0.5 * z * z - log_std - 0.5 * math.log(2 * math.pi), axis=-1)
 
 
-def surrogate(ratio: jax.Array, advantage: jax.Array, clip_eps: float) -> jax.Array:
+def surrogate(ratio: Array, advantage: Array, clip_eps: float) -> Array:
     """Return the clipped surrogate objective (...) to maximise (Schulman et al. 2017, Eq. 7)."""
     bounded = jnp.clip(ratio, 1 - clip_eps, 1 + clip_eps)
     return jnp.minimum(ratio * advantage, bounded * advantage)
 
 
-def means(network: Network, actor: Weights, hidden: jax.Array, steps: Transition) -> jax.Array:
+def means(network: Network, actor: Weights, hidden: Array, steps: Transition) -> Array:
     """Return mean actions (T, N, A), from the hidden state (N, 2, H) before the first action."""
     if network.kind == "mlp":
         return network.apply(actor, hidden[None], steps.obs)[1]
 
-    def apply(hidden: jax.Array, step: Pair) -> Pair:
+    def apply(hidden: Array, step: Pair) -> Pair:
         obs, first = step
         hidden = jnp.where(first[:, None, None], 0.0, hidden)
         return network.apply(actor, hidden, obs)
@@ -207,11 +207,11 @@ def loss(
     ppo: PPO,
     network: Network,
     weights: Weights,  # as in `TrainState`
-    hidden: jax.Array,  # (N, 2, H) of the network before the first transition
+    hidden: Array,  # (N, 2, H) of the network before the first transition
     steps: Transition,  # leaves (T, N, ...)
-    advantage: jax.Array,  # (T, N) [1], normalised
-    target: jax.Array,  # (T, N) [1] of the value function
-    schedule: jax.Array | float = 1.0,  # () factor of ent_coef
+    advantage: Array,  # (T, N) [1], normalised
+    target: Array,  # (T, N) [1] of the value function
+    schedule: Array | float = 1.0,  # () factor of ent_coef
 ) -> Pair:
     """Return the loss of a minibatch of worlds, and the KL divergence from the acting policy."""
     mean = means(network, weights["actor"], hidden, steps)
@@ -229,12 +229,12 @@ def update_policy(
     ppo: PPO,
     network: Network,
     state: TrainState,
-    key: jax.Array,
-    hidden: jax.Array,
+    key: Array,
+    hidden: Array,
     steps: Transition,
-    schedule: jax.Array | float = 1.0,  # () factor of annealed options
-    frozen: jax.Array | bool = False,  # () bool: whether the policy does not change
-) -> tuple[TrainState, jax.Array]:
+    schedule: Array | float = 1.0,  # () factor of annealed options
+    frozen: Array | bool = False,  # () bool: whether the policy does not change
+) -> tuple[TrainState, Array]:
     """Update the weights by all passes over transitions; return the new state and the mean KL
     divergence of the steps."""
     advantage = advantages(steps, ppo.gamma, ppo.gae_lambda)
@@ -246,7 +246,7 @@ def update_policy(
     orders = jax.vmap(lambda k: jax.random.permutation(k, count))(keys)
     batches = orders[:, : size * ppo.num_minibatches].reshape(-1, size)
 
-    def step(carry: UpdateCarry, batch: jax.Array) -> tuple[UpdateCarry, jax.Array]:
+    def step(carry: UpdateCarry, batch: Array) -> tuple[UpdateCarry, Array]:
         weights, optimiser, rate = carry
         data = jax.tree.map(lambda x: x[:, batch], (steps, advantage, target))
         loss_of = partial(loss, ppo, network)

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-import jax
 import numpy as np
 import xarray as xr
 
@@ -25,6 +24,7 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams, unit_of_leaf
 from rps_jax.control.registry import LawLike
+from rps_jax.geometry.arrays import Array
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
@@ -58,7 +58,7 @@ DIMS = {
 
 _SHOWN = 100  # rows of the table of parameters in a report
 Domains = DomainLike | Sequence[DomainLike]
-Results = Mapping[str, np.ndarray | jax.Array | float]  # of a generation, by name
+Results = Mapping[str, np.ndarray | Array | float]  # of a generation, by name
 Proposal = Mapping[str, np.ndarray]  # arrays by name, `vectors` (P, p) among them
 # Runs candidates in the worlds of a tuning.
 ScoreCandidates = Callable[[list[Candidates]], list[CandidateScores]]

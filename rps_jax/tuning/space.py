@@ -15,6 +15,7 @@ from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import Bound, LawParams, Leaf, entries
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
+from rps_jax.geometry.arrays import Array
 from rps_jax.record.files import JsonObject
 
 SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}  # of RPS
@@ -64,7 +65,7 @@ class Space:
         leaves = registry.named_leaves(self.base)
         return {label: name for name in self.names for label, _ in entries(name, leaves[name])}
 
-    def vector(self, params: LawParams) -> jax.Array:
+    def vector(self, params: LawParams) -> Array:
         """Return the vector (..., p) of parameters with leaves (...)."""
         values, base = registry.named_leaves(params), registry.named_leaves(self.base)
         columns = []

@@ -18,14 +18,13 @@ from __future__ import annotations
 from functools import partial
 from typing import Annotated, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control.base import Law, OmegaMax, SpeedMax, SuccessDistance
 from rps_jax.control.observation import Details, PoseObservation, Twist, displacement
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Pair, Parameter
+from rps_jax.geometry.arrays import Array, Pair, Parameter
 from rps_jax.robot.shell import HALF_LENGTH
 from rps_jax.spec import Spec, document
 
@@ -66,17 +65,17 @@ class APSParams(NamedTuple):
 class APSState(NamedTuple):
     """State of APS between two control steps."""
 
-    p_world_object: Annotated[jax.Array, Spec("m", "O at its last motion")]  # (2,)
-    a_OT: Annotated[jax.Array, Spec("rad", "direction from there to T")]  # ()
-    started: Annotated[jax.Array, Spec("1", "whether the fields above are set")]  # () bool
-    alpha: Annotated[jax.Array, Spec("rad", "alpha of the last step")]  # ()
-    gamma: Annotated[jax.Array, Spec("rad", "the last motion error")]  # ()
-    gamma_mean: Annotated[jax.Array, Spec("rad", "m_gamma, mean motion error")]  # ()
-    gamma_count: Annotated[jax.Array, Spec("1", "number of motion errors in gamma_mean")]  # ()
-    mean: Annotated[jax.Array, Spec("rad", "m, running mean of good alphas")]  # ()
-    variance: Annotated[jax.Array, Spec("rad^2", "s2, running variance of good alphas")]  # ()
-    weight: Annotated[jax.Array, Spec("1", "number of alphas in mean and variance")]  # ()
-    yaw_error: Annotated[jax.Array, Spec("rad", "heading error of the last step")]  # ()
+    p_world_object: Annotated[Array, Spec("m", "O at its last motion")]  # (2,)
+    a_OT: Annotated[Array, Spec("rad", "direction from there to T")]  # ()
+    started: Annotated[Array, Spec("1", "whether the fields above are set")]  # () bool
+    alpha: Annotated[Array, Spec("rad", "alpha of the last step")]  # ()
+    gamma: Annotated[Array, Spec("rad", "the last motion error")]  # ()
+    gamma_mean: Annotated[Array, Spec("rad", "m_gamma, mean motion error")]  # ()
+    gamma_count: Annotated[Array, Spec("1", "number of motion errors in gamma_mean")]  # ()
+    mean: Annotated[Array, Spec("rad", "m, running mean of good alphas")]  # ()
+    variance: Annotated[Array, Spec("rad^2", "s2, running variance of good alphas")]  # ()
+    weight: Annotated[Array, Spec("1", "number of alphas in mean and variance")]  # ()
+    yaw_error: Annotated[Array, Spec("rad", "heading error of the last step")]  # ()
 
     @classmethod
     def init(cls, params: APSParams) -> APSState:
@@ -102,7 +101,7 @@ def predictive(params: APSParams, state: APSState) -> Pair:
     return mean / precision, 1 / precision + state.variance
 
 
-def activations(params: APSParams, state: APSState, alpha: jax.Array, near: jax.Array) -> Pair:
+def activations(params: APSParams, state: APSState, alpha: Array, near: Array) -> Pair:
     """Return (psi_push, psi_relocate) [1] at alpha [rad]; the robot approaches unless `near`.
 
     Like the released controller, we divide by the predictive variance, not by its square root.
@@ -115,9 +114,7 @@ def activations(params: APSParams, state: APSState, alpha: jax.Array, near: jax.
     return jnp.where(near, back_off, 1.0), jnp.where(near, relocate, 0.0)
 
 
-def _learn(
-    params: APSParams, state: APSState, p_world_object: jax.Array, a_OT: jax.Array
-) -> APSState:
+def _learn(params: APSParams, state: APSState, p_world_object: Array, a_OT: Array) -> APSState:
     """Return the state after an observation of the object, which may have moved."""
     motion = p_world_object - state.p_world_object
     moved = state.started & (planar.norm(motion) > params.min_motion)
@@ -131,7 +128,7 @@ def _learn(
     variance = state.variance + (offset * (state.alpha - mean) - state.variance) / count
     gamma_mean = state.gamma_mean + (gamma - state.gamma_mean) / gamma_count
 
-    def where(condition: jax.Array, **new: jax.Array) -> dict[str, jax.Array]:
+    def where(condition: Array, **new: Array) -> dict[str, Array]:
         return {key: jnp.where(condition, x, getattr(state, key)) for key, x in new.items()}
 
     return state._replace(
@@ -142,7 +139,7 @@ def _learn(
     )
 
 
-def _aim(params: APSParams, obs: PoseObservation) -> jax.Array:
+def _aim(params: APSParams, obs: PoseObservation) -> Array:
     """Return the aim (2,) [m] beyond the target, on the line from the contact or the object."""
     touch = obs.touch
     of_contact = planar.direction(displacement(touch))

@@ -16,14 +16,13 @@ the target by `beyond` radii; the base turns to face the object.
 from functools import partial
 from typing import Annotated, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control.base import Law, OmegaMax, SuccessDistance, bounds_of
 from rps_jax.control.observation import Details, PoseObservation, Twist
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Parameter
+from rps_jax.geometry.arrays import Array, Parameter
 from rps_jax.spec import Spec, document, tunable
 
 
@@ -50,8 +49,8 @@ class DipoleParams(NamedTuple):
 class DipoleState(NamedTuple):
     """State of the law between two control steps."""
 
-    p_world_start: Annotated[jax.Array, Spec("m", "start of the path")]  # (2,)
-    started: Annotated[jax.Array, Spec("1", "whether there is a path")]  # () bool
+    p_world_start: Annotated[Array, Spec("m", "start of the path")]  # (2,)
+    started: Annotated[Array, Spec("1", "whether there is a path")]  # () bool
 
 
 check = partial(spec.check, prefix="dipole.")
@@ -68,7 +67,7 @@ def step(
     """Compute one control step: along the field line through the robot, facing the object."""
     touch, p_world_object = obs.touch, obs.p_world_object
 
-    def path_direction(start: jax.Array) -> jax.Array:
+    def path_direction(start: Array) -> Array:
         return planar.unit(planar.direction(touch.p_world_target - start))
 
     past = jnp.sum((p_world_object - touch.p_world_target) * path_direction(state.p_world_start))

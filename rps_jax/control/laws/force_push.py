@@ -33,7 +33,7 @@ from rps_jax.control import soft
 from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SuccessDistance, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Parameter, Pytree, Scalar
+from rps_jax.geometry.arrays import Array, Parameter, Pytree, Scalar
 from rps_jax.spec import Spec, document, tunable
 
 # Parameters of both forms of Force Push.
@@ -77,10 +77,10 @@ class ForcePushParams(NamedTuple):
 class Path(NamedTuple):
     """Path of the contact: a straight line from a contact through the target."""
 
-    p_world_start: Annotated[jax.Array, Spec("m", "start of the path")]  # (2,)
-    theta_d: Annotated[jax.Array, Spec("rad", "direction of the path in the world")]  # ()
-    p_robot_contact: Annotated[jax.Array, Spec("m", "the last contact")]  # (2,)
-    touched: Annotated[jax.Array, Spec("1", "whether there was a contact")]  # () bool
+    p_world_start: Annotated[Array, Spec("m", "start of the path")]  # (2,)
+    theta_d: Annotated[Array, Spec("rad", "direction of the path in the world")]  # ()
+    p_robot_contact: Annotated[Array, Spec("m", "the last contact")]  # (2,)
+    touched: Annotated[Array, Spec("1", "whether there was a contact")]  # () bool
 
     @classmethod
     def initial(cls, dtype: jax.typing.DTypeLike) -> Path:
@@ -88,7 +88,7 @@ class Path(NamedTuple):
         two = jnp.zeros(2, dtype)
         return cls(two, jnp.zeros((), dtype), two, jnp.zeros((), bool))
 
-    def update(self, obs: Observation) -> tuple[Path, Observation, jax.Array]:
+    def update(self, obs: Observation) -> tuple[Path, Observation, Array]:
         """Return path, observation with the last contact, and its offset () [m] to the left.
 
         A new path starts when the contact has passed the target, or the target has left the path.
@@ -109,7 +109,7 @@ class Path(NamedTuple):
         offset = jnp.sum((p_world_contact - p_world_start) * normal)
         return Path(p_world_start, theta_d, contact, self.touched | touching), filled, offset
 
-    def twist(self, params: Pytree, v_robot: jax.Array, yaw: Scalar) -> Twist:
+    def twist(self, params: Pytree, v_robot: Array, yaw: Scalar) -> Twist:
         """Return the twist that moves the contact at `v_robot` (2,) [m/s] and faces along the path.
 
         Before the first contact the base moves straight ahead.
@@ -126,9 +126,9 @@ class ForcePushState(NamedTuple):
     """State of the law between two control steps."""
 
     path: Path
-    theta_p: Annotated[jax.Array, Spec("rad", "angle of the last push from the path")]  # ()
-    l_mean: Annotated[jax.Array, Spec("m", "mean of l over the last motion")]  # ()
-    p_world_robot: Annotated[jax.Array, Spec("m", "position of the base at the last step")]  # (2,)
+    theta_p: Annotated[Array, Spec("rad", "angle of the last push from the path")]  # ()
+    l_mean: Annotated[Array, Spec("m", "mean of l over the last motion")]  # ()
+    p_world_robot: Annotated[Array, Spec("m", "position of the base at the last step")]  # (2,)
 
 
 check = partial(spec.check, prefix="force_push.")
@@ -142,12 +142,12 @@ def init(params: ForcePushParams) -> ForcePushState:
 
 def steer(
     params: Pytree,  # of either law
-    theta_p: jax.Array,  # () [rad] at the last step
-    theta_f: jax.Array,  # () [rad] angle of the force from the path
-    offset: jax.Array,  # () [m] of the contact, to the path's left
+    theta_p: Array,  # () [rad] at the last step
+    theta_f: Array,  # () [rad] angle of the force from the path
+    offset: Array,  # () [m] of the contact, to the path's left
     limit: Scalar,  # () [rad] bound on the change of theta_p without contact
-    in_contact: jax.Array,
-) -> jax.Array:
+    in_contact: Array,
+) -> Array:
     """Return the angle () [rad] of the push from the path."""
     pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
     back = theta_p + jnp.clip(planar.wrap(-params.k_y * offset - theta_p), -limit, limit)

@@ -24,7 +24,6 @@ acceleration.
 from functools import partial
 from typing import Annotated, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
@@ -33,7 +32,7 @@ from rps_jax.control.laws import force_push
 from rps_jax.control.laws.force_push import AngleGain, ContactSpeed, HeadingGain, Path
 from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Parameter
+from rps_jax.geometry.arrays import Array, Parameter
 from rps_jax.spec import Spec, document, tunable
 
 
@@ -72,8 +71,8 @@ class PublishedForcePushState(NamedTuple):
     """State of the law between two control steps."""
 
     path: Path
-    theta_p: Annotated[jax.Array, Spec("rad", "angle of the last push from the path")]  # ()
-    pushed: Annotated[jax.Array, Spec("1", "whether a contact and a force were sensed")]  # () bool
+    theta_p: Annotated[Array, Spec("rad", "angle of the last push from the path")]  # ()
+    pushed: Annotated[Array, Spec("1", "whether a contact and a force were sensed")]  # () bool
 
 
 check = partial(spec.check, prefix="force_push_published.")
@@ -85,9 +84,7 @@ def init(params: PublishedForcePushParams) -> PublishedForcePushState:
     return PublishedForcePushState(Path.initial(zero.dtype), zero, jnp.zeros((), bool))
 
 
-def yield_to_force(
-    params: PublishedForcePushParams, v_world: jax.Array, f_world: jax.Array
-) -> jax.Array:
+def yield_to_force(params: PublishedForcePushParams, v_world: Array, f_world: Array) -> Array:
     """Return the contact's velocity (2,) [m/s], reduced where the force (2,) [N] is too large."""
     size = planar.norm(f_world)
     over = jnp.maximum(size - params.f_max, 0.0)

@@ -12,7 +12,6 @@ contacts that occur under the offsets.
 
 from typing import Annotated, Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +23,7 @@ from rps_jax.control.laws import rps, unicycle
 from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.laws.unicycle import UnicycleParams, UnicycleState
 from rps_jax.control.observation import Details, Observation, Twist
-from rps_jax.geometry.arrays import Number, Parameter
+from rps_jax.geometry.arrays import Array, Number, Parameter
 from rps_jax.robot.robot import DriveKind
 from rps_jax.spec import Spec, document, specs_of
 
@@ -62,7 +61,7 @@ class GuidedState(NamedTuple):
     """State of the law, and the number of control steps."""
 
     law: RPSState | UnicycleState
-    steps: Annotated[jax.Array, Spec("1", "finished control steps")]  # () int32
+    steps: Annotated[Array, Spec("1", "finished control steps")]  # () int32
 
 
 _LAWS: dict[type, Any] = {  # checks, and functions of the laws that are guided

@@ -56,7 +56,6 @@ is a weight that mixes the twists of Q6; modes and legs switch.
 from functools import partial
 from typing import Annotated, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -163,30 +162,30 @@ class PoseParams(NamedTuple):
 class PoseState(NamedTuple):
     """State of the law between two control steps."""
 
-    mode: Annotated[jax.Array, Spec("1", "0 push or approach, 1 back off, 2 drive around")]
-    leg: Annotated[jax.Array, Spec("1", "k, direction of the push in quarter turns from theta")]
-    h: Annotated[jax.Array, Spec("m", "supports of the box in the grid, Q1 to Q3")]  # (4,)
-    known: Annotated[jax.Array, Spec("1", "whether each is known")]  # (4,) bool
-    centred: Annotated[jax.Array, Spec("1", "whether the middle of each axis was felt")]  # (2,)
-    p_world_contact: Annotated[jax.Array, Spec("m", "the last contact")]  # (2,)
-    p_world_front: Annotated[jax.Array, Spec("m", "middle of the front, a step before")]  # (2,)
-    p_world_base: Annotated[jax.Array, Spec("m", "filtered position of the base")]  # (2,)
-    yaw: Annotated[jax.Array, Spec("rad", "filtered heading of the base")]
-    twist: Annotated[jax.Array, Spec("m/s, m/s, rad/s", "last command")]  # (3,)
-    touched: Annotated[jax.Array, Spec("1", "whether there was a contact")]
-    time: Annotated[jax.Array, Spec("s", "time since the start")]
-    t_lost: Annotated[jax.Array, Spec("s", "time since the last contact")]
-    t_push: Annotated[jax.Array, Spec("s", "time in contact of this push; 0 in an approach")]
-    t_even: Annotated[jax.Array, Spec("s", "time of even contact; negative: of uneven contact")]
-    look: Annotated[jax.Array, Spec("m", "Q9, position of the base to the left, in the leg")]
-    looking: Annotated[jax.Array, Spec("1", "whether the base looks for an end")]
-    looks: Annotated[jax.Array, Spec("1", "number of looks in this leg")]
-    tries: Annotated[jax.Array, Spec("1", "number of repetitions")]
-    goal: Annotated[jax.Array, Spec("m, m, rad", "pose of the goal in the world")]  # (3,)
-    oriented: Annotated[jax.Array, Spec("1", "whether a goal's relative heading is known")]
-    side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around the object; -1: clockwise")]
-    gear: Annotated[jax.Array, Spec("1", "1: forwards around the object; -1: in reverse")]
-    done: Annotated[jax.Array, Spec("1", "whether the law is done")]
+    mode: Annotated[Array, Spec("1", "0 push or approach, 1 back off, 2 drive around")]
+    leg: Annotated[Array, Spec("1", "k, direction of the push in quarter turns from theta")]
+    h: Annotated[Array, Spec("m", "supports of the box in the grid, Q1 to Q3")]  # (4,)
+    known: Annotated[Array, Spec("1", "whether each is known")]  # (4,) bool
+    centred: Annotated[Array, Spec("1", "whether the middle of each axis was felt")]  # (2,)
+    p_world_contact: Annotated[Array, Spec("m", "the last contact")]  # (2,)
+    p_world_front: Annotated[Array, Spec("m", "middle of the front, a step before")]  # (2,)
+    p_world_base: Annotated[Array, Spec("m", "filtered position of the base")]  # (2,)
+    yaw: Annotated[Array, Spec("rad", "filtered heading of the base")]
+    twist: Annotated[Array, Spec("m/s, m/s, rad/s", "last command")]  # (3,)
+    touched: Annotated[Array, Spec("1", "whether there was a contact")]
+    time: Annotated[Array, Spec("s", "time since the start")]
+    t_lost: Annotated[Array, Spec("s", "time since the last contact")]
+    t_push: Annotated[Array, Spec("s", "time in contact of this push; 0 in an approach")]
+    t_even: Annotated[Array, Spec("s", "time of even contact; negative: of uneven contact")]
+    look: Annotated[Array, Spec("m", "Q9, position of the base to the left, in the leg")]
+    looking: Annotated[Array, Spec("1", "whether the base looks for an end")]
+    looks: Annotated[Array, Spec("1", "number of looks in this leg")]
+    tries: Annotated[Array, Spec("1", "number of repetitions")]
+    goal: Annotated[Array, Spec("m, m, rad", "pose of the goal in the world")]  # (3,)
+    oriented: Annotated[Array, Spec("1", "whether a goal's relative heading is known")]
+    side: Annotated[Array, Spec("1", "1: counter-clockwise around the object; -1: clockwise")]
+    gear: Annotated[Array, Spec("1", "1: forwards around the object; -1: in reverse")]
+    done: Annotated[Array, Spec("1", "whether the law is done")]
 
 
 check = partial(spec.check, prefix="pose.")

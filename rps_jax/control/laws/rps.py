@@ -216,7 +216,7 @@ def check(params: RPSParams) -> RPSParams:
 HARD: Any = Temperatures._make([None] * len(Temperatures._fields))  # the paper's switches
 
 
-def _sgn(params: RPSParams, x: jax.Array, temperature: ArrayLike | None) -> jax.Array:
+def _sgn(params: RPSParams, x: Array, temperature: ArrayLike | None) -> Array:
     """Compute sgn(x) with the parameter sgn(0), by default 0: no lateral motion at l = 0."""
     if temperature is None:
         return jnp.where(x == 0, params.sgn_0, jnp.sign(x))
@@ -271,8 +271,8 @@ def saturate(params: RPSParams, twist: Twist) -> Twist:
 
 
 def _push(
-    params: RPSParams, l_th: jax.Array, obs: Observation, temps: Temperatures
-) -> tuple[jax.Array, Twist, Details]:
+    params: RPSParams, l_th: Array, obs: Observation, temps: Temperatures
+) -> tuple[Array, Twist, Details]:
     """Compute one pass of Algorithm 1's control loop, in contact."""
     l = obs.l  # noqa: E741
     d = displacement(obs)

@@ -30,7 +30,6 @@ world, and the number of control steps since.
 
 from typing import Annotated, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
@@ -40,7 +39,7 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Number, Parameter, Scalar
+from rps_jax.geometry.arrays import Array, Number, Parameter, Scalar
 from rps_jax.spec import Spec, document, tunable
 
 FACING = 0.3  # [rad] P3's facing
@@ -88,9 +87,9 @@ class RPSPlusState(NamedTuple):
     """State of RPS+ between two control steps."""
 
     law: RPSState
-    p_world_contact: Annotated[jax.Array, Spec("m", "the last contact")]  # (2,)
+    p_world_contact: Annotated[Array, Spec("m", "the last contact")]  # (2,)
     steps_lost: Annotated[
-        jax.Array, Spec("1", "control steps since then; a float in the smooth law")
+        Array, Spec("1", "control steps since then; a float in the smooth law")
     ]  # () int32
 
 
@@ -110,7 +109,7 @@ def init(params: RPSPlusParams, temperatures: Temperatures | None = None) -> RPS
     return RPSPlusState(state, jnp.zeros_like(state.p_robot_contact), steps_lost)
 
 
-def translation(params: RPSPlusParams, d: jax.Array, yaw: Scalar) -> Twist:
+def translation(params: RPSPlusParams, d: Array, yaw: Scalar) -> Twist:
     """Compute P2: the twist that moves the contact straight along d (2,) [m] in the world."""
     error = planar.wrap(planar.direction(d) - yaw)
     speed = params.law.K_v * planar.norm(d)
@@ -121,8 +120,8 @@ def translation(params: RPSPlusParams, d: jax.Array, yaw: Scalar) -> Twist:
 
 def search(
     params: RPSPlusParams,
-    p_robot_last: jax.Array,
-    l: jax.Array,  # noqa: E741
+    p_robot_last: Array,
+    l: Array,  # noqa: E741
     temps: Temperatures = rps.HARD,
 ) -> Twist:
     """Compute P3: the twist back to the last contact, `p_robot_last` (2,) [m] in the robot frame.

@@ -16,7 +16,6 @@ ahead and aside, since dead taxels may have pushed the object along. It senses w
 
 from typing import Annotated, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
@@ -26,7 +25,7 @@ from rps_jax.control.laws import rps_plus, unicycle
 from rps_jax.control.laws.rps_plus import RPSPlusParams, RPSPlusState
 from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Number, Parameter
+from rps_jax.geometry.arrays import Array, Number, Parameter
 from rps_jax.spec import Spec, document, tunable
 
 _AHEAD = 1.26  # [rad] by which the base aims ahead on the circle
@@ -61,12 +60,12 @@ class RPSRepositionState(NamedTuple):
     """State of the law between two control steps."""
 
     law: RPSPlusState
-    p_world_object: Annotated[jax.Array, Spec("m", "M, middle of the object")]  # (2,)
-    best: Annotated[jax.Array, Spec("m", "distance of C to the target at the last progress")]
-    t_stuck: Annotated[jax.Array, Spec("s", "time since the last progress")]
-    away: Annotated[jax.Array, Spec("1", "whether the base repositions")]  # () bool
-    approach: Annotated[jax.Array, Spec("1", "whether it moves from the last W to M")]  # () bool
-    side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around M; -1: clockwise")]
+    p_world_object: Annotated[Array, Spec("m", "M, middle of the object")]  # (2,)
+    best: Annotated[Array, Spec("m", "distance of C to the target at the last progress")]
+    t_stuck: Annotated[Array, Spec("s", "time since the last progress")]
+    away: Annotated[Array, Spec("1", "whether the base repositions")]  # () bool
+    approach: Annotated[Array, Spec("1", "whether it moves from the last W to M")]  # () bool
+    side: Annotated[Array, Spec("1", "1: counter-clockwise around M; -1: clockwise")]
 
 
 def check(params: RPSRepositionParams) -> RPSRepositionParams:

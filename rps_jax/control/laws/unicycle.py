@@ -46,7 +46,6 @@ and target; axle and turning radius R are static facts. The smooth law mixes the
 from functools import partial, reduce
 from typing import Annotated, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
@@ -62,7 +61,7 @@ from rps_jax.control.base import (
 )
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Number, Parameter
+from rps_jax.geometry.arrays import Array, Number, Parameter
 from rps_jax.robot.shell import HALF_LENGTH
 from rps_jax.spec import Spec, document, tunable
 
@@ -135,17 +134,17 @@ class Widths(NamedTuple):
 class UnicycleState(NamedTuple):
     """State of the law; the modes are bools, or weights of the smooth law, and no mode: push."""
 
-    retreat: Annotated[jax.Array, Spec("1", "whether the base retreats")]
-    around: Annotated[jax.Array, Spec("1", "whether it drives around the object")]
-    align: Annotated[jax.Array, Spec("1", "whether it turns at the staging point")]
-    p_world_object: Annotated[jax.Array, Spec("m", "M, middle of the object")]  # (2,)
-    p_world_contact: Annotated[jax.Array, Spec("m", "C, the last contact")]  # (2,)
-    l: Annotated[jax.Array, Spec("m", "contact offset at C")]  # noqa: E741
-    touched: Annotated[jax.Array, Spec("1", "whether there was a contact")]
-    t_lost: Annotated[jax.Array, Spec("s", "time since the last contact")]
-    pushed: Annotated[jax.Array, Spec("1", "whether this push had a contact; 0 in an approach")]
-    side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around M; -1: clockwise")]
-    misses: Annotated[jax.Array, Spec("1", "approaches since the last contact that missed")]
+    retreat: Annotated[Array, Spec("1", "whether the base retreats")]
+    around: Annotated[Array, Spec("1", "whether it drives around the object")]
+    align: Annotated[Array, Spec("1", "whether it turns at the staging point")]
+    p_world_object: Annotated[Array, Spec("m", "M, middle of the object")]  # (2,)
+    p_world_contact: Annotated[Array, Spec("m", "C, the last contact")]  # (2,)
+    l: Annotated[Array, Spec("m", "contact offset at C")]  # noqa: E741
+    touched: Annotated[Array, Spec("1", "whether there was a contact")]
+    t_lost: Annotated[Array, Spec("s", "time since the last contact")]
+    pushed: Annotated[Array, Spec("1", "whether this push had a contact; 0 in an approach")]
+    side: Annotated[Array, Spec("1", "1: counter-clockwise around M; -1: clockwise")]
+    misses: Annotated[Array, Spec("1", "approaches since the last contact that missed")]
 
 
 check = partial(spec.check, prefix="unicycle.")
@@ -162,14 +161,14 @@ def init(params: UnicycleParams, temperatures: Widths | None = None) -> Unicycle
 class Contact(NamedTuple):
     """Contact of one control step, or the last one."""
 
-    touches: jax.Array
-    p_robot: jax.Array  # (2,) [m]
-    normal: jax.Array  # [rad] direction of the base's normal there, in its frame
-    on_front: jax.Array  # bool or weight
+    touches: Array
+    p_robot: Array  # (2,) [m]
+    normal: Array  # [rad] direction of the base's normal there, in its frame
+    on_front: Array  # bool or weight
     half_length: Number  # [m] from the base's middle to its front
 
 
-def contact_of(p_world_last: jax.Array, obs: Observation, widths: Widths | None = None) -> Contact:
+def contact_of(p_world_last: Array, obs: Observation, widths: Widths | None = None) -> Contact:
     """Return the current contact, or the last one at `p_world_last` (2,) [m]."""
     touches = jnp.asarray(obs.in_contact)
     last = planar.rotate(-obs.yaw, p_world_last - obs.p_world_robot)
@@ -184,7 +183,7 @@ def contact_of(p_world_last: jax.Array, obs: Observation, widths: Widths | None 
     return Contact(touches, point, normal, on_front, half_length)
 
 
-def push_direction(middle: jax.Array, base: jax.Array, target: jax.Array, r: Number) -> jax.Array:
+def push_direction(middle: Array, base: Array, target: Array, r: Number) -> Array:
     """Compute D2 [rad] from the positions (2,) [m] of object, base and target in the world."""
     to_target = target - middle
     flips = (planar.norm(to_target) < r) & (jnp.sum(to_target * (base - middle)) > 0)
@@ -194,15 +193,15 @@ def push_direction(middle: jax.Array, base: jax.Array, target: jax.Array, r: Num
 class Way(NamedTuple):
     """Way around the object, D6."""
 
-    side: jax.Array  # [1] 1: counter-clockwise, or -1
-    is_direct: jax.Array  # bool or weight: whether W is the staging point
-    staging: jax.Array  # (2,) [m]
-    aim: jax.Array  # (2,) [m] W
+    side: Array  # [1] 1: counter-clockwise, or -1
+    is_direct: Array  # bool or weight: whether W is the staging point
+    staging: Array  # (2,) [m]
+    aim: Array  # (2,) [m] W
 
 
 def turn_around(
-    psi: jax.Array, offset: jax.Array, side: jax.Array, chooses: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+    psi: Array, offset: Array, side: Array, chooses: Array
+) -> tuple[Array, Array, Array]:
     """Return phi and the turn from there to psi + pi [rad], and the side: see D6.
 
     The `offset` (2,) [m] is from M. Where it `chooses`, the side is that of the shorter turn.
@@ -215,11 +214,11 @@ def turn_around(
 
 
 def way_around(
-    middle: jax.Array,  # (2,) [m] M
-    psi: jax.Array,  # [rad]
-    offset: jax.Array,  # (2,) [m] from M to the axle, or to the middle of the base
-    side: jax.Array,  # [1] the last choice
-    chooses: jax.Array,  # bool: whether the side is chosen anew
+    middle: Array,  # (2,) [m] M
+    psi: Array,  # [rad]
+    offset: Array,  # (2,) [m] from M to the axle, or to the middle of the base
+    side: Array,  # [1] the last choice
+    chooses: Array,  # bool: whether the side is chosen anew
     radius: Number,  # [m] of the circle
     distance: Number,  # [m] of the staging point from M
     ahead: Number,  # [rad] of the aim on the circle
@@ -233,12 +232,12 @@ def way_around(
     return Way(side, is_direct, staging, soft.where(is_direct, staging, carrot))
 
 
-def _either(*conditions: jax.Array) -> jax.Array:
+def _either(*conditions: Array) -> Array:
     """Return whether one of several conditions holds that exclude each other; a sum of weights."""
     return reduce(lambda a, b: a | b if a.dtype == b.dtype == bool else a + b, conditions)
 
 
-def _is(condition: jax.Array) -> jax.Array:
+def _is(condition: Array) -> Array:
     """Return a condition as a bool."""
     return condition if condition.dtype == bool else condition > 0.5
 

@@ -23,6 +23,7 @@ from rps_jax.control.observation import (
     displacement,
 )
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Array
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot import skin as skins
 from rps_jax.robot.skin import LINE, NONE, CapacitiveSkin, Reading, Skin, SkinState
@@ -68,15 +69,15 @@ OBSERVATIONS = {"taxels": taxel_observation, "ends": ends_observation}
 class TouchState(NamedTuple):
     """Record of touch, with positions by odometry."""
 
-    p_world_contact: Annotated[jax.Array, Spec("m", "the last contact")]  # (2,)
-    touched: Annotated[jax.Array, Spec("1", "whether there was a contact")]  # () bool
-    time_since_contact: Annotated[jax.Array, Spec("s", "time since the last contact")]  # ()
+    p_world_contact: Annotated[Array, Spec("m", "the last contact")]  # (2,)
+    touched: Annotated[Array, Spec("1", "whether there was a contact")]  # () bool
+    time_since_contact: Annotated[Array, Spec("s", "time since the last contact")]  # ()
     in_contact: Annotated[
-        jax.Array, Spec("1", "whether there is a contact in this control step")
+        Array, Spec("1", "whether there is a contact in this control step")
     ]  # () bool
-    p_robot_decision: Annotated[jax.Array, Spec("m", "the contact at the last decision")]  # (2,)
+    p_robot_decision: Annotated[Array, Spec("m", "the contact at the last decision")]  # (2,)
     has_decided: Annotated[
-        jax.Array, Spec("1", "whether the last decision was made in contact")
+        Array, Spec("1", "whether the last decision was made in contact")
     ]  # () bool
 
     @classmethod
@@ -103,7 +104,7 @@ class TouchState(NamedTuple):
             p_robot_decision=self.p_robot_contact(obs), has_decided=self.in_contact
         )
 
-    def p_robot_contact(self, obs: TaxelObservation) -> jax.Array:
+    def p_robot_contact(self, obs: TaxelObservation) -> Array:
         """Return the last contact (2,) [m] in the current robot frame; 0 before any contact."""
         touch = obs.touch
         p_robot_last = planar.rotate(-touch.yaw, self.p_world_contact - touch.p_world_robot)
@@ -111,7 +112,7 @@ class TouchState(NamedTuple):
         return jnp.where(self.touched, p_robot, 0.0)
 
 
-def _vector_features(p_robot: jax.Array) -> list[jax.Array]:
+def _vector_features(p_robot: Array) -> list[Array]:
     """Return the direction of a vector (2,) [m], and its length on two scales."""
     length = planar.norm(p_robot)
     direction = p_robot / jnp.maximum(length, 1e-6)
@@ -135,9 +136,7 @@ def feature_count(taxels: int) -> int:
     return taxels + _SIGNS.size
 
 
-def compute_features(
-    touch_state: TouchState, action: jax.Array, obs: TaxelObservation
-) -> jax.Array:
+def compute_features(touch_state: TouchState, action: Array, obs: TaxelObservation) -> Array:
     """Compute the input features (F,) of the network at a decision.
 
     `action` (3,) [1] is the last one. `touch_state` is already updated with `obs`.
@@ -163,14 +162,14 @@ def compute_features(
     )
 
 
-def mirror(features: jax.Array) -> jax.Array:
+def mirror(features: Array) -> Array:
     """Return the features (..., F) of the mirrored world, with the strip of taxels reversed."""
     count = features.shape[-1] - _SIGNS.size
     signs = jnp.asarray(_SIGNS, features.dtype)
     return jnp.concatenate([features[..., :count][..., ::-1], features[..., count:] * signs], -1)
 
 
-def clip_action(action: jax.Array) -> jax.Array:
+def clip_action(action: Array) -> Array:
     """Saturate an action [1], (..., 3), or (..., 2) without v_y, to a twist (..., 3) of norm 1.
 
     Both are shares of the largest twist.

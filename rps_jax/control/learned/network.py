@@ -20,7 +20,7 @@ from rps_jax.control.base import OmegaMax, SpeedMax, SuccessDistance
 from rps_jax.control.learned import features
 from rps_jax.control.learned.features import TouchState
 from rps_jax.control.observation import Details, TaxelObservation, Twist
-from rps_jax.geometry.arrays import Pair
+from rps_jax.geometry.arrays import Array, Pair
 from rps_jax.spec import Spec, specs_of
 
 NetworkKind = Literal["mlp", "gru"]
@@ -56,11 +56,11 @@ class Network(NamedTuple):
         second = _dense("second", n, n) if self.kind == "mlp" else gru
         return _dense("first", size, n) | second | _dense("action", n, self.actions)
 
-    def init(self, key: jax.Array) -> Weights:
+    def init(self, key: Array) -> Weights:
         """Return random weights, with a mean action near zero."""
         return init_weights(self.shapes, key, small=("action",))
 
-    def apply(self, weights: Weights, hidden: jax.Array, inputs: jax.Array) -> Pair:
+    def apply(self, weights: Weights, hidden: Array, inputs: Array) -> Pair:
         """Map features (..., F) to the hidden state (..., 2, H) and mean action (..., A) [1]."""
         x = jnp.tanh(dense(weights, "first", mirror_pairs(inputs)))
         if self.kind == "mlp":
@@ -87,14 +87,14 @@ def critic_shapes(inputs: int, width: int) -> Shapes:
     )
 
 
-def critic(weights: Weights, pair: jax.Array) -> jax.Array:
+def critic(weights: Weights, pair: Array) -> Array:
     """Compute the value (...) of pairs (..., 2, n), which is invariant under mirroring."""
     x = jnp.tanh(dense(weights, "first", pair))
     x = jnp.tanh(dense(weights, "second", x))
     return jnp.mean(dense(weights, "value", x)[..., 0], axis=-1)
 
 
-def init_weights(shapes: Shapes, key: jax.Array, small: tuple[str, ...] = ()) -> Weights:
+def init_weights(shapes: Shapes, key: Array, small: tuple[str, ...] = ()) -> Weights:
     """Draw normal weights of variance 1 over the inputs, and zero biases.
 
     Weights of the layers named in `small` are a hundred times smaller.
@@ -108,18 +108,18 @@ def init_weights(shapes: Shapes, key: jax.Array, small: tuple[str, ...] = ()) ->
     return weights
 
 
-def mirror_pairs(inputs: jax.Array) -> jax.Array:
+def mirror_pairs(inputs: Array) -> Array:
     """Stack features (..., F) with those of the mirrored world, to (..., 2, F)."""
     return jnp.stack([inputs, features.mirror(inputs)], axis=-2)
 
 
-def dense(weights: Weights, name: str, pair: jax.Array) -> jax.Array:
+def dense(weights: Weights, name: str, pair: Array) -> Array:
     """Apply an equivariant dense layer to pairs (..., 2, n)."""
     both = jnp.concatenate([pair, pair[..., ::-1, :]], axis=-1)
     return both @ weights[f"{name}.w"] + weights[f"{name}.b"]
 
 
-def _apply_gru(weights: Weights, hidden: jax.Array, x: jax.Array) -> jax.Array:
+def _apply_gru(weights: Weights, hidden: Array, x: Array) -> Array:
     """Apply a gated recurrent unit to pairs (..., 2, n)."""
     both = jnp.concatenate([x, hidden], axis=-1)
     reset, update = jnp.split(jax.nn.sigmoid(dense(weights, "memory.gates", both)), 2, axis=-1)
@@ -134,11 +134,9 @@ class PolicyState(NamedTuple):
     """State of a learned law between two control steps."""
 
     touch_state: TouchState
-    hidden: Annotated[
-        jax.Array, Spec("1", "hidden state of the network")
-    ]  # (2, H), H = 0 for an MLP
-    action: Annotated[jax.Array, Spec("1", "current action")]  # (3,)
-    waiting: Annotated[jax.Array, Spec("s", "time until the next decision")]  # ()
+    hidden: Annotated[Array, Spec("1", "hidden state of the network")]  # (2, H), H = 0 for an MLP
+    action: Annotated[Array, Spec("1", "current action")]  # (3,)
+    waiting: Annotated[Array, Spec("s", "time until the next decision")]  # ()
 
     @classmethod
     def init(cls, network: Network, dtype: jax.typing.DTypeLike = float) -> PolicyState:
@@ -147,7 +145,7 @@ class PolicyState(NamedTuple):
         hidden = jnp.zeros((2, network.width if network.kind == "gru" else 0), dtype)
         return cls(TouchState.initial(dtype), hidden, jnp.zeros(3, dtype), zero)
 
-    def due(self, obs: TaxelObservation) -> jax.Array:
+    def due(self, obs: TaxelObservation) -> Array:
         """Whether this control step needs a decision."""
         return self.waiting < 0.5 * obs.touch.period
 
@@ -168,7 +166,7 @@ def observe_sent(
     return state._replace(action=jnp.where(state.due(obs), action, state.action))
 
 
-def _twist_bounds(params: LearnedParams) -> jax.Array:
+def _twist_bounds(params: LearnedParams) -> Array:
     return jnp.stack([params.v_max, params.v_max, params.omega_max])
 
 

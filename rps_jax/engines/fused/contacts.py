@@ -129,7 +129,7 @@ def _stiffness(solref: tuple[float, float], d_max: float, timestep: float) -> tu
     return 1 / (d_max * time * ratio) ** 2, 2 / (d_max * time)
 
 
-def _index(count: int, template: Number) -> jax.Array:
+def _index(count: int, template: Number) -> Array:
     """Return 0, 1, ... along a new leading axis of the batch of `template`."""
     return jax.lax.broadcasted_iota(jnp.int32, (count, *jnp.shape(template)), 0)
 

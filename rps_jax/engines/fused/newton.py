@@ -23,7 +23,7 @@ from jax.ad_checkpoint import checkpoint_name
 from rps_jax.engines.fused.contacts import Body, Contact, Point, State
 from rps_jax.engines.native import restrict, varied_indices
 from rps_jax.geometry import vectors as sp
-from rps_jax.geometry.arrays import Number, Pytree
+from rps_jax.geometry.arrays import Array, Number, Pytree
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.geometry.vectors import Vec
 from rps_jax.robot.base import Tyres
@@ -225,12 +225,12 @@ def accelerations(
     leaves, tree = jax.tree.flatten((problem, solution))
     positions = [i for i, x in enumerate(leaves) if isinstance(x, jax.Array)]
 
-    def rebuilt(arrays: Sequence[jax.Array]) -> tuple[Problem, Sequence[Vec] | None]:
+    def rebuilt(arrays: Sequence[Array]) -> tuple[Problem, Sequence[Vec] | None]:
         values = dict(zip(positions, arrays, strict=True))
         return tree.unflatten([values.get(i, x) for i, x in enumerate(leaves)])
 
     @jax.custom_jvp
-    def run(arrays: list[jax.Array]) -> list[Vec]:
+    def run(arrays: list[Array]) -> list[Vec]:
         problem, solution = rebuilt(arrays)
         return _minimise(problem, physics) if solution is None else list(solution)
 
@@ -238,7 +238,7 @@ def accelerations(
         (arrays,), (directions,) = primals, tangents
         x = checkpoint_name(run(arrays), SOLUTION)
 
-        def gradient(arrays: list[jax.Array]) -> tuple[list[Number], list[list[Number]]]:
+        def gradient(arrays: list[Array]) -> tuple[list[Number], list[list[Number]]]:
             g, h = rebuilt(arrays)[0].gradient(x, physics)
             return [jnp.asarray(entry) for entry in g], h
 
@@ -329,7 +329,7 @@ def _sums(vector: Vec) -> Vec:
     return sp.total(vector[0]), sp.total(vector[1]), sp.total(vector[2])
 
 
-def _any(active: jax.Array) -> jax.Array:
+def _any(active: Array) -> Array:
     """Whether any entry is above zero."""
     return jnp.sum(active) > 0
 
