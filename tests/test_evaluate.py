@@ -69,9 +69,8 @@ def tuner_keys(command):
         with patched, pytest.raises(StoppedError):
             bank.worlds(4, Run(None, no_progress))
         return keys, set()
-    params = command.space.params(command.base[None])
-    validation = command.validation_candidates(params)
-    return {command.candidates(params, 3).seed}, {validation.seed}
+    validation = command.validation_candidates(command.base)
+    return {command.candidates(command.base[None], 3).seed}, {validation.seed}
 
 
 def stopped(keys, seed, index):

@@ -509,6 +509,9 @@ class TaskOption:
     """The task: its name, or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
     Changes follow, as corridor,width=1.2:1.6. By default the domain's, reach."""
 
+    # They are part of the domain.
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("robot", "task")
+
     @property
     def _robot_and_task(self) -> tuple[RobotLike, Task]:
         domain: Any = getattr(self, "domain", "wide")
@@ -536,9 +539,7 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
         return name_or_custom(self.domain) + task_in_words(self.ranges)
 
     def fields_as_json(self) -> JsonObject:
-        """Return the fields as JSON; robot and task are part of the domain."""
-        record = super().fields_as_json() | {"domain": domains.to_json(self.ranges)}
-        return {name: x for name, x in record.items() if name not in ("robot", "task")}
+        return super().fields_as_json() | {"domain": domains.to_json(self.ranges)}
 
     def attributes(self) -> dict[str, str | int]:
         return super().attributes() | task_attribute(self.ranges)

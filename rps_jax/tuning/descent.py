@@ -195,10 +195,10 @@ class TuneGrad(Descent):
         """Validate, and measure the slope of whole trials along a gradient (p,)."""
         vector, way = jnp.asarray(proposal["vectors"][0]), jnp.nan_to_num(gradient)
         way = way / jnp.maximum(jnp.sqrt(jnp.mean(way**2)), 1e-30)
-        tried = [self.validation_candidates(self.space.params(vector[None]))]
+        tried = [self.validation_candidates(vector)]
         if self.checks:
             pair = vector + self.sigma * jnp.stack([way, -way])
-            fresh = self.tried(pair, generation, self.checks)
+            fresh = self.candidates(pair, generation, self.checks)
             tried.append(replace(fresh, worlds=fresh.worlds + self.trials))
         validation, *pairs = score(tried)
         slope = variance = np.nan
@@ -220,7 +220,7 @@ class TuneGrad(Descent):
         self, vectors: np.ndarray, generation: int, times: dict[str, float]
     ) -> list[_States]:
         """Run trials of the original law with a vector (1, p)."""
-        families, tried = [], self.tried(jnp.asarray(vectors), generation, self.trials)
+        families, tried = [], self.candidates(vectors, generation, self.trials)
         for batch in tried.batches(self.setting):
             stage, soft = batch.stage, soften_skins(batch.worlds)
             inputs = jnp.asarray(vectors[0]), stage, batch.worlds, soft

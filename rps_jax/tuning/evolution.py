@@ -42,11 +42,6 @@ class Descent(Tuning):
     pairs: int = option(1, 1, 1_000_000)
     """Number of antithetic pairs of random steps in each world."""
 
-    def tried(self, vectors: Array, generation: int, worlds: int) -> Candidates:
-        """Return the vectors (P, p) as candidates in the first worlds of a generation."""
-        candidates = self.candidates(self.space.params(vectors), generation)
-        return replace(candidates, worlds=candidates.worlds[0] + np.arange(worlds))
-
     def antithetic(
         self, vector: Array, generation: int, worlds: int
     ) -> tuple[Candidates, Callable[[CandidateScores], Estimate]]:
@@ -58,7 +53,7 @@ class Descent(Tuning):
         options, count = gradients.Options(sigma=self.sigma, pairs=self.pairs), worlds
         count *= len(self.domains)
         steps, thetas, _ = gradients.random_steps(vector, jnp.arange(count), key, options)
-        tried = self.tried(thetas.reshape(-1, count, vector.size), generation, worlds)
+        tried = self.candidates(thetas.reshape(-1, count, vector.size), generation, worlds)
 
         def estimate(scores: CandidateScores) -> Estimate:
             values = jnp.ravel(jnp.asarray(scores.score))
@@ -81,7 +76,7 @@ class Descent(Tuning):
         Without worlds the slopes are NaN.
         """
         vector = jnp.asarray(proposal["vectors"][0])
-        check = self.validation_candidates(self.space.params(vector[None]))
+        check = self.validation_candidates(vector)
         none = jnp.full_like(vector, jnp.nan)
         if not worlds:
             return self.step_results(proposal, *score([check])), Estimate(none, none, none)
@@ -231,13 +226,12 @@ class TuneES(Descent):
             worlds = self.worlds if generation < self.generations else 0
             results, slopes = self.try_step(proposal, generation, score, worlds)
             return {**results, **gradient_results(slopes)}
-        vectors, space = proposal["vectors"], self.space
-        tried = self.candidates(space.params(np.vstack([vectors, self.base])), generation)
-        center = self.validation_candidates(space.params(proposal["center"][None]))
-        candidates, check = score([tried, center])
+        vectors, center = proposal["vectors"], proposal["center"]
+        tried = self.candidates(np.vstack([vectors, self.base]), generation)
+        candidates, check = score([tried, self.validation_candidates(center)])
         *values, base_value = np.asarray(self.objective.value(candidates.score))
         distances = np.mean((vectors - self.base) ** 2, axis=-1)
-        start = {"vectors": proposal["center"][None], "base": base_value}
+        start = {"vectors": center[None], "base": base_value}
         return {
             **self.step_results(start, check),
             "values": values + self.prior * distances,

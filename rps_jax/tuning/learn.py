@@ -3,7 +3,6 @@
 `Learn` holds the options and the report. `_Learner` holds the programs and the state of a run.
 """
 
-import functools
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,19 +28,17 @@ from rps_jax.control.learned.policy import Policy
 from rps_jax.engines import device
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, SimulationQuestion, TaskOption, call_of
+from rps_jax.runs.question import Run, call_of
 from rps_jax.spec import Spec
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
-from rps_jax.trials.setting import Setting, Split, seed_of
+from rps_jax.trials.setting import Setting, Split
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import collection
 from rps_jax.tuning.collection import RunnerState
 from rps_jax.tuning.ppo import PPO
-from rps_jax.tuning.run import Domains, parse_domains
-from rps_jax.world.domain import Domain, task_attribute, to_json
+from rps_jax.tuning.run import DomainsQuestion
 from rps_jax.world.tasks.base import heading_of
 
 _CHECKPOINT = "learner"
@@ -69,7 +66,7 @@ METRICS = {  # of an update, by name
 
 
 @dataclass(frozen=True)
-class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
+class Learn(PPO, DomainsQuestion):
     """Learn a law from touch by PPO, in random worlds for tuning, and write it as `policy.npz`.
 
     The answer is the learning curve: the metrics of each update (update), with units as
@@ -87,7 +84,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     """
 
     TITLE = "A learned law"
-    IGNORED_FIELDS = ("minutes", "updates", "every", "task")
+    IGNORED_FIELDS = ("minutes", "updates", "every")
     REPORTS_TIMES = True
     RENAMED: ClassVar = {
         "hard": "prioritised",
@@ -108,9 +105,6 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         "updates": 300,  # on any machine the same number
     }
 
-    domain: Domains = ("wide",)
-    """Domains to learn in: their names, or JSON files of ranges; changes follow each, as
-    wide,objects=random_box."""
     minutes: float = option(10.0, 0, 1e5, unit="min")
     """Wall clock after which the run stops [min], with compilation and validation, summed over all
     processes of the run; 0 means no limit."""
@@ -133,11 +127,6 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     )
     out: Path | str | None = field(default="runs/learn", kw_only=True)
     """Run folder, with `policy.npz`; a killed run resumes there."""
-
-    @functools.cached_property
-    def domains(self) -> tuple[Domain, ...]:
-        """Domains to learn in."""
-        return parse_domains(self.domain, self.task, self.robot)
 
     def check(self) -> None:
         if self.out is None:
@@ -166,16 +155,6 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
                 raise errors.not_allowed("initial", self.initial, rule)
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
-
-    def attributes(self) -> dict[str, str | int]:
-        return super().attributes() | task_attribute(self.domains[0])
-
-    def fields_as_json(self) -> JsonObject:
-        """Fields as JSON, with domains by their ranges."""
-        seed = seed_of(self.setting.seed, "tune")
-        ranges = list(map(to_json, self.domains))
-        record = {name: x for name, x in super().fields_as_json().items() if name != "robot"}
-        return record | {"domain": ranges, "tune_seed": seed}
 
     def environments(self, split: Split = "tune") -> list[PushEnv]:
         """Return the environments of a split; those for validation have the paper's rules."""

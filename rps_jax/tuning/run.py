@@ -16,31 +16,38 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures import sweeps as figures
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
-from rps_jax.control.base import LawParams, unit_of_leaf
+from rps_jax.control.base import unit_of_leaf
 from rps_jax.control.registry import LawLike
 from rps_jax.geometry.arrays import Array
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
-from rps_jax.robot.robot import RobotLike
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import DefaultLaw, LawQuestion, Run, TaskOption, count_true
+from rps_jax.runs.question import (
+    DefaultLaw,
+    LawQuestion,
+    Run,
+    SimulationQuestion,
+    TaskOption,
+    count_true,
+)
 from rps_jax.spec import Spec
 from rps_jax.trials.progress import Bar, Progress, Timing
+from rps_jax.trials.results import labelled
 from rps_jax.trials.score import Objective
-from rps_jax.trials.setting import seed_of
+from rps_jax.trials.setting import Split, seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world.domain import Domain, DomainLike, parse_domain, task_attribute, to_json
 from rps_jax.world.objects import STORED
-from rps_jax.world.tasks import TaskLike
 
 TUNED = "tuned.json"  # file of a run folder: the parameters with the best validation
 TIMES = {  # of a generation
@@ -67,10 +74,33 @@ Search = Generator[Proposal, Mapping[str, np.ndarray], None]
 
 
 @dataclass(frozen=True)
-class Tuning(TaskOption, LawQuestion[xr.Dataset]):
+class DomainsQuestion(TaskOption, SimulationQuestion[xr.Dataset]):
+    """Base of the questions for better laws in random worlds of some domains."""
+
+    domain: Domains = ("wide",)
+    """Domains of the worlds: their names, or JSON files of ranges; changes follow each, as
+    wide,mass=3:10."""
+
+    @functools.cached_property
+    def domains(self) -> tuple[Domain, ...]:
+        """The domains, with robot and task."""
+        several = [self.domain] if isinstance(self.domain, str | Domain) else self.domain
+        return tuple(parse_domain(item, self.robot, self.task) for item in several)
+
+    def attributes(self) -> dict[str, str | int]:
+        return super().attributes() | task_attribute(self.domains[0])
+
+    def fields_as_json(self) -> JsonObject:
+        """Fields as JSON, with domains by their ranges, and the seed of the worlds."""
+        ranges, seed = list(map(to_json, self.domains)), seed_of(self.setting.seed, "tune")
+        return super().fields_as_json() | {"domain": ranges, "tune_seed": seed}
+
+
+@dataclass(frozen=True)
+class Tuning(DomainsQuestion, LawQuestion[xr.Dataset]):
     """Base of the questions for better parameters of a law."""
 
-    IGNORED_FIELDS = ("budget", "minutes", "generations", "task")
+    IGNORED_FIELDS = ("budget", "minutes", "generations")
     REPORTS_TIMES = True
     QUICK: ClassVar = {
         # The few parameters that matter most, since few trials cannot determine more; cylinders on
@@ -90,9 +120,6 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     law: LawLike = DefaultLaw("rps")
     """Law with the initial parameters: a name, as rps, rps_tuned or rps_plus, or a file's class
     with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
-    domain: Domains = ("wide",)
-    """Domains to tune in: their names, or JSON files of ranges; changes follow each, as
-    wide,mass=3:10."""
     objects: Annotated[tuple[str, ...], STORED] = ("random_box", "random_cylinder")
     """Objects of these domains; random_prism is held out by default."""
     tuned: tuple[str, ...] = ("full",)
@@ -120,22 +147,25 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     @functools.cached_property
     def domains(self) -> tuple[Domain, ...]:
         """Domains of the worlds in which candidates are tried."""
-        ranges = tuple(
-            replace(d, objects=self.objects)
-            for d in parse_domains(self.domain, self.task, self.robot)
-        )
+        ranges = tuple(replace(d, objects=self.objects) for d in super().domains)
         errors.check_each_once("domain", ranges)
         return ranges
 
-    def candidates(self, params: LawParams, generation: int) -> Candidates:
-        """Return candidates with leaves (P,) and the worlds of a generation."""
-        worlds = generation * self.worlds + np.arange(self.worlds)
-        return Candidates(params, self.domains, seed_of(self.setting.seed, "tune"), worlds)
+    def candidates(
+        self, vectors: ArrayLike, generation: int, count: int | None = None
+    ) -> Candidates:
+        """Return vectors (P, p) in the worlds of a generation, or in the first `count` of them."""
+        worlds = generation * self.worlds + np.arange(count or self.worlds)
+        return self._candidates(vectors, "tune", worlds)
 
-    def validation_candidates(self, params: LawParams) -> Candidates:
-        """Return candidates with leaves (P,) and the worlds for validation."""
-        seed = seed_of(self.setting.seed, "validate")
-        return Candidates(params, self.domains, seed, np.arange(self.validation))
+    def validation_candidates(self, vector: ArrayLike) -> Candidates:
+        """Return a vector (p,) as the only candidate in the worlds for validation."""
+        return self._candidates(np.asarray(vector)[None], "validate", np.arange(self.validation))
+
+    def _candidates(self, vectors: ArrayLike, split: Split, worlds: np.ndarray) -> Candidates:
+        """Return vectors (P, p) in the worlds of a split with some indices, of each domain."""
+        params, seed = self.space.params(vectors), seed_of(self.setting.seed, split)
+        return Candidates(params, self.domains, seed, worlds)
 
     @functools.cached_property
     def base(self) -> np.ndarray:
@@ -186,15 +216,9 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         for domain in self.domains:
             self.setting.check_domain(domain, [self.space.base])
 
-    def attributes(self) -> dict[str, str | int]:
-        return super().attributes() | task_attribute(self.domains[0])
-
     def fields_as_json(self) -> JsonObject:
-        """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""
-        ranges, seed = list(map(to_json, self.domains)), seed_of(self.setting.seed, "tune")
-        record = {"tuned": self.space.names, "domain": ranges, "tune_seed": seed}
-        fields = super().fields_as_json()
-        return {name: x for name, x in fields.items() if name != "robot"} | record
+        """Fields as JSON, with the names of all tuned parameters."""
+        return super().fields_as_json() | {"tuned": self.space.names}
 
     def progress_bar(self) -> Bar:
         name = self.name.replace("_", " ")
@@ -231,7 +255,10 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             names = {*map(str, results), "vectors", "center", "validation", "simulated"}
             dims = {name: DIMS.get(name, ()) for name in names}
             files.check_columns(results, run.folder, dims, {})
-            if not _is_of_proposal(results, proposal["vectors"]):
+            tried, vectors = results.vectors, proposal["vectors"]
+            # Another machine may round otherwise; the search uses the vectors that were tried.
+            tolerance = {"rtol": 1e-4, "atol": 1e-4, "equal_nan": True}
+            if tried.shape != vectors.shape or not np.allclose(tried, vectors, **tolerance):
                 reason = f"generation {count} is of another search or version"
                 raise files.CorruptFileError(run.folder, reason)
             if results.validation < least:
@@ -250,19 +277,17 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     def _test(self, best: np.ndarray, run: Run) -> xr.Dataset:
         """Return the success of start and tuned law in worlds that the search has not met."""
 
+        dims = "tested", "test_world"
+
         def compute() -> xr.Dataset:
-            params, seed = self.space.params(np.stack([self.base, best])), self.setting.seed
-            worlds = np.arange(self.validation)
-            request = Candidates(params, self.domains, seed_of(seed, "test"), worlds)
-            (scores,), _ = self._score([request], run)
-            attrs = {"units": "1", "long_name": "success in worlds that the search has not met"}
-            success = np.asarray(scores.outcome.success, np.int8)
-            variables = {"test_success": (("tested", "test_world"), success, attrs)}
+            both, worlds = np.stack([self.base, best]), np.arange(self.validation)
+            (scores,), _ = self._score([self._candidates(both, "test", worlds)], run)
+            meaning = "success in worlds that the search has not met"
+            variables = labelled(test_success=(dims, scores.outcome.success, "1", meaning))
             return xr.Dataset(variables, {"tested": ["start", "tuned"]})
 
         results = run.checkpoint(f"test-{files.sha256(best.tobytes())[:8]}", compute)
-        dims = {"test_success": ("tested", "test_world")}
-        return files.check_columns(results, run.folder, dims, {})
+        return files.check_columns(results, run.folder, {"test_success": dims}, {})
 
     def _score(self, tried: list[Candidates], run: Run) -> tuple[list[CandidateScores], Timing]:
         """Run candidates; return their outcomes and scores, and where the time went."""
@@ -352,22 +377,3 @@ def test_sentences(success: xr.DataArray) -> str:
         f"{rates[0]} and the tuned law in {rates[1]}; {c.gained} gained and {c.lost} lost "
         f"(McNemar p = {c.p:.2g}). {verdict}"
     )
-
-
-def _is_of_proposal(results: xr.Dataset, vectors: np.ndarray) -> bool:
-    """Return whether these are results of the proposed vectors.
-
-    The tolerance allows for other rounding on another machine; the search uses the vectors that
-    were tried.
-    """
-    return results.vectors.shape == vectors.shape and np.allclose(
-        results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True
-    )
-
-
-def parse_domains(
-    domain: Domains, task: TaskLike | None = None, robot: RobotLike | None = None
-) -> tuple[Domain, ...]:
-    """Return one or several domains by their names, files or ranges."""
-    several = [domain] if isinstance(domain, str | Domain) else domain
-    return tuple(parse_domain(item, robot, task) for item in several)
