@@ -82,7 +82,7 @@ def shift_window(outputs):
 
 def read_itself(outputs):
     node = first(outputs, Call, "choose_f")
-    node.operands = (*node.operands[:2], Array(node, 0, 1, (5,)))
+    node.operands = (*node.operands[:2], Array(node, (5,)))
 
 
 def undefined_in_loop(outputs):
@@ -106,7 +106,7 @@ def wrong_condition(outputs):
 
 def alias_carried(outputs):
     loop = first(outputs, LoopNode)
-    loop.results = (loop.results[0], Array(loop.carried[1], 2, 0, (5,)))
+    loop.results = (loop.results[0], Array(loop.carried[1], (5,), 2, 0))
 
 
 def wrong_result(outputs):

@@ -99,7 +99,7 @@ class GraphBuilder(Target):
     def input(self, index: int, shape: Shape, dtype: object) -> Array:
         """Return an argument of the function."""
         kind, size = self.kind(dtype, "an argument"), size_of(shape)
-        return Array(self.node(Input(index), (), kind, size), 0, 1, shape)
+        return Array(self.node(Input(index), (), kind, size), shape)
 
     def scalar(self, value: Value, index: int) -> Value:
         """Return one number of a value."""
@@ -123,7 +123,7 @@ class GraphBuilder(Target):
 
     def stack(self, scalars: Values, kind: str, shape: Shape) -> Array:
         """Return scalars of several nodes as an array."""
-        return Array(self.node(Gather(), scalars, kind, len(scalars)), 0, 1, shape)
+        return Array(self.node(Gather(), scalars, kind, len(scalars)), shape)
 
     def apply(self, name: str, values: Values, params: Params, out: Typed) -> Value:
         kind = self.kind(out.dtype, name)
@@ -145,7 +145,7 @@ class GraphBuilder(Target):
                 indices = np.arange(size_of(value_shape)).reshape(value_shape)
                 value = self.gather([value], np.broadcast_to(indices, shape), value)
             operands.append(flat(value, size))
-        return Array(self.node(Call(function), operands, kind, size), 0, 1, shape)
+        return Array(self.node(Call(function), operands, kind, size), shape)
 
     def _reduced(
         self, binary: str, value: Value, axes: Sequence[int], kind: str, out: Typed
@@ -153,7 +153,7 @@ class GraphBuilder(Target):
         """Reduce all elements in one loop that other nodes share, or some axes row by row."""
         shape, size = np.shape(value), size_of(np.shape(value))
         if len(axes) == len(shape) and size > 1 and (binary, kind) in INITIAL:
-            return Array(self.node(Reduce(binary), [flat(value, size)], kind, size), 0, 0, ())
+            return Array(self.node(Reduce(binary), [flat(value, size)], kind, size), (), step=0)
         return reduced_by_rows(self, binary, value, axes, out)
 
     def _product(self, lhs: Value, rhs: Value, dimensions: Any, out: Typed) -> Value:
@@ -197,12 +197,12 @@ class GraphBuilder(Target):
         index, windows = sliding_windows(self, shape, starts, sizes)
         if is_constant(value):
             scalars = list(np.reshape(value, -1))
-            value = Array(self.node(Gather(), scalars, kind, len(scalars)), 0, 1, shape)
+            value = Array(self.node(Gather(), scalars, kind, len(scalars)), shape)
         if value.step != 1 or value.node.size == 1:
             return self.gather([value], windows[0].reshape(sizes), template=value)
         op = DynamicSlice(tuple(map(tuple, (windows + value.first).tolist())))
         node = self.node(op, [flat(index, 1), value], kind, windows.shape[1])
-        return Array(node, 0, 1, tuple(sizes))
+        return Array(node, tuple(sizes))
 
     # --- loops ---
 
@@ -220,7 +220,7 @@ class GraphBuilder(Target):
             kind, shape = self.kind(x.dtype, "a loop"), np.shape(x)
             node = Node(next(self._ids), Carried(), (), kind, size_of(shape))
             carried.append(node)
-            current.append(Array(node, 0, 1, shape) if node.size else x)
+            current.append(Array(node, shape) if node.size else x)
         self._scopes.append({})
         (holds,) = condition(current) if condition else (None,)
         results = []
@@ -228,8 +228,7 @@ class GraphBuilder(Target):
             value = flat(value, node.size) if node.size else value
             if isinstance(value, Array) and value.node in carried and not is_unchanged(node, value):
                 copies = [element(value, i) for i in range(node.size)]
-                copy = self.node(Gather(), copies, node.kind, node.size)
-                value = Array(copy, 0, 1, value.shape)
+                value = Array(self.node(Gather(), copies, node.kind, node.size), value.shape)
             results.append(value)
         self._scopes.pop()
         holds = None if holds is None else flat(holds, 1)
@@ -255,7 +254,7 @@ class GraphBuilder(Target):
         last = []
         for node, x in zip(carried, carry, strict=True):
             result = Node(next(self._ids), LoopResult(node), (), node.kind, node.size, (loop,))
-            last.append(Array(result, 0, 1, np.shape(x)) if node.size else x)
+            last.append(Array(result, np.shape(x)) if node.size else x)
         return last
 
 

@@ -55,7 +55,10 @@ class CWriter(ScalarWriter):
         def text(value: np.ndarray) -> str:
             if value.ndim:
                 return self.array_literal(map(text, value))
-            return table_entry(self.prefix, value, kind)
+            # A float in its shortest form, if it is one, also for double.
+            short = np.float32(value)
+            exact = kind == "f" and np.isfinite(short) and float(short) == float(value)
+            return f"{short!s}f" if exact else self.literal(value.item(), kind)
 
         sized = sized_name(name, array.shape)
         return f"static {self.declaration(kind, sized)} = {text(array)};"
@@ -72,13 +75,6 @@ def literal(prefix: str, value: float, kind: str) -> str:
         return str(int(bool(value)))
     text = literal_of(value, kind, suffix="")
     return f"({prefix}_real){text}" if kind == "f" else text
-
-
-def table_entry(prefix: str, value: np.ndarray, kind: str) -> str:
-    """Return an entry of a table: a float in its shortest form if it is one, also for double."""
-    short = np.float32(value)
-    exact = kind == "f" and np.isfinite(short) and float(short) == float(value)
-    return f"{short!s}f" if exact else literal(prefix, value.item(), kind)
 
 
 def sized_name(name: str, sizes: Iterable[int]) -> str:

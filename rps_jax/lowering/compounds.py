@@ -47,10 +47,6 @@ def _is_real(x: jax.Array) -> bool:
     return jnp.issubdtype(x.dtype, jnp.floating)
 
 
-def _sign(x: jax.Array) -> jax.Array:
-    return jnp.where(x > 0, 1, jnp.where(x < 0, -1, x))
-
-
 def _round(x: jax.Array, **_: object) -> jax.Array:
     """Round halves away from zero."""
     size = jnp.abs(x)
@@ -86,11 +82,6 @@ def _integer(x: jax.Array, **_: object) -> jax.Array:
     """Convert reals to integers: NaN to 0."""
     whole = _truncation(jnp.where((x >= -_BOUND) & (x < _BOUND), x, 0))
     return jnp.where(x >= _BOUND, 2**31 - 1, jnp.where(x < -_BOUND, -(2**31), whole))
-
-
-def _of_bool(x: jax.Array, new_dtype: np.dtype, **_: object) -> jax.Array:
-    """Convert bools to numbers."""
-    return jnp.where(x, new_dtype.type(1), new_dtype.type(0))
 
 
 def _unsigned(x: jax.Array, **_: object) -> jax.Array:
@@ -318,7 +309,7 @@ COMPOUNDS: dict[str, Function] = {
     "lt_to": _less_in_total_order,
     "le_to": lambda x, y: ~_lt_to(y, x),
     "abs_i": lambda x: jnp.maximum(x, -x),
-    "sign": _sign,
+    "sign": lambda x: jnp.where(x > 0, 1, jnp.where(x < 0, -1, x)),
     "sign_u": lambda x: jnp.minimum(x, 1),
     "neg_u": lambda x: 0 - x,
     "not_u": lambda x: x ^ np.uint32(2**32 - 1),
@@ -341,7 +332,10 @@ COMPOUNDS: dict[str, Function] = {
     "i_of_f": _integer,
     "u_of_f": _unsigned,
     **dict.fromkeys(("b_of_f", "b_of_i", "b_of_u"), lambda x, **_: x != 0),
-    **dict.fromkeys(("f_of_b", "i_of_b", "u_of_b"), _of_bool),
+    **dict.fromkeys(
+        ("f_of_b", "i_of_b", "u_of_b"),
+        lambda x, new_dtype, **_: jnp.where(x, new_dtype.type(1), new_dtype.type(0)),
+    ),
     **dict.fromkeys(("bits_i_of_u", "bits_u_of_i"), lambda x, new_dtype: x.astype(new_dtype)),
     "choose_b": lambda flag, no, yes: (flag & yes) | (~flag & no),
     "select_n": _select,

@@ -86,7 +86,7 @@ class GpuBuilder(SimdBuilder):
             )
             for j, template in enumerate(first.operands)
         ]
-        return Array(self.node(op, operands, kind, size), 0, 1, (size,))
+        return Array(self.node(op, operands, kind, size), (size,))
 
     def apply(self, name: str, values: Values, params: Params, out: Typed) -> Value:
         """Apply a primitive; sums over threads are added before they are exchanged."""
@@ -105,12 +105,12 @@ class GpuBuilder(SimdBuilder):
         if node is None or not isinstance(node.op, Reduce):
             return result
         op = Call(f"{node.op.binary}_over_threads_{node.kind}")
-        return Array(self.node(op, [result], node.kind, 1), 0, 1, result.shape)
+        return Array(self.node(op, [result], node.kind, 1), result.shape)
 
     def _sum(self, name: str, lhs: Node, rhs: Node, out: Typed) -> Array:
         partial = [x.operands[0]._replace(shape=out.shape) for x in (lhs, rhs)]
         total = super().apply(name, partial, {}, out)
-        return Array(self.node(_SUM, [flat(total, 1)], "f", 1), 0, 1, out.shape)
+        return Array(self.node(_SUM, [flat(total, 1)], "f", 1), out.shape)
 
 
 def _operand(a: Array, j: int) -> Value:
@@ -118,7 +118,7 @@ def _operand(a: Array, j: int) -> Value:
     operand = a.node.operands[j]
     if not isinstance(operand, Array):
         return np.reshape(operand, -1)[a.first if np.size(operand) > 1 else 0]
-    return gathered_scalar(Array(operand.node, operand.first + operand.step * a.first, 1, ()))
+    return gathered_scalar(Array(operand.node, (), operand.first + operand.step * a.first))
 
 
 def _node_of(value: Value) -> Node | None:

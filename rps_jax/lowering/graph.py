@@ -224,8 +224,6 @@ Operation: TypeAlias = (
     Input | Call | Reduce | Gather | DynamicSlice | MatrixProduct | Carried | LoopResult
 )
 
-_FUSIBLE = (Call, Reduce)
-
 # --- nodes -------------------------------------------------------------------------------------
 
 
@@ -263,7 +261,7 @@ class Node:
     @property
     def is_fusible(self) -> bool:
         """Whether it is computed in a loop over elements, which other nodes may share."""
-        return self.size > 1 and isinstance(self.op, _FUSIBLE)
+        return self.size > 1 and isinstance(self.op, Call | Reduce)
 
     @functools.cached_property
     def fusion_barriers(self) -> set[Node]:
@@ -288,9 +286,9 @@ class Array(NamedTuple):
     """View of a node: elements from `first` on (`step` 1), or one element repeated (`step` 0)."""
 
     node: Node
-    first: int
-    step: int
     shape: Shape
+    first: int = 0
+    step: int = 1
 
     @property
     def dtype(self) -> np.dtype:
@@ -334,7 +332,7 @@ def key_of(value: Value) -> Hashable:
 def element(value: Value, index: int) -> Value:
     """Return one number of a value as an operand."""
     if isinstance(value, Array):
-        return Array(value.node, value.first + value.step * index, 1, ())
+        return Array(value.node, (), value.first + value.step * index)
     return np.asarray(value).reshape(-1)[index]
 
 
@@ -352,7 +350,7 @@ def view_of(scalars: Values, shape: Shape) -> Array | None:
         offsets = np.array([a.first - first.first for a in scalars])
         for step in (1, 0):
             if (offsets == step * np.arange(len(offsets))).all():
-                return Array(first.node, first.first, step, shape)
+                return Array(first.node, shape, first.first, step)
     return None
 
 

@@ -67,8 +67,8 @@ def statements(
     lines = list(writer.body)
     for group, field, value in writer.outputs:
         names = [writer.operand(value, i) for i in range(field.size)]
-        array = np.array(names, object).reshape(field.shape).tolist()
-        lines.append(f"const result_{group}_{field.name} = {_nested(array)};")
+        text = str(np.array(names, object).reshape(field.shape).tolist()).replace("'", "")
+        lines.append(f"const result_{group}_{field.name} = {text};")
     return "\n".join(f"  {line}" for line in lines)
 
 
@@ -88,8 +88,3 @@ def text_of(value: object) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     return json.dumps(value)
-
-
-def _nested(names: object) -> str:
-    """Return names in nested lists as text."""
-    return "[" + ", ".join(map(_nested, names)) + "]" if isinstance(names, list) else str(names)

@@ -74,16 +74,11 @@ def fields_of(tree: Pytree, values: Pytree = None) -> Group:
         name = identifier(path.removeprefix("touch.")) or "value"
         dtype = np.dtype(getattr(leaf, "dtype", np.asarray(leaf).dtype))
         value = None if value is None else np.asarray(value)
-        kind = kind_of(dtype, kinds="fib")
-        fields.append(Field(name, tuple(np.shape(leaf)), kind, _about(tree, path), value))
+        kind, about = kind_of(dtype, kinds="fib"), str(spec_at(tree, path) or "")
+        fields.append(Field(name, np.shape(leaf), kind, about.replace("*/", ""), value))
     names = [field.name for field in fields]
     errors.check_each_once("names of the law's numbers", names) if names else None
     return tuple(fields)
-
-
-def _about(tree: Pytree, path: str) -> str:
-    """Return the declared unit and meaning of a leaf."""
-    return str(spec_at(tree, path) or "").replace("*/", "")
 
 
 def identifier(text: str) -> str:

@@ -93,7 +93,7 @@ class ScalarBuilder(GraphBuilder):
             return self.gather(halves, np.arange(2 * columns), np.empty(0))
         op = MatrixProduct(matrix.shape, matrix.tobytes())
         node = self.node(op, list(itertools.chain(*rows)), "f", len(rows) * columns)
-        return Array(node, 0, 1, (node.size,))
+        return Array(node, (node.size,))
 
 
 # --- blocks ------------------------------------------------------------------------------------
@@ -113,15 +113,17 @@ def sink_products(roots: Sequence[Node]) -> list[Node]:
     return nodes
 
 
-def _condition(node: Node) -> tuple[Node, int] | None:
-    """Return the node and the index of the number by which a node chooses an operand."""
+def _condition(node: Node) -> Array | None:
+    """Return the number by which a node chooses an operand, if it is one for all elements."""
     is_choice = isinstance(node.op, Call) and node.op.function.startswith("choose_")
     a = node.operands[0] if is_choice else None
-    return (a.node, a.first) if isinstance(a, Array) and (not a.step or node.size == 1) else None
+    if isinstance(a, Array) and (not a.step or node.size == 1):
+        return Array(a.node, (1,), a.first)
+    return None
 
 
 def _move_into_block(
-    nodes: Sequence[Node], roots: Sequence[Node], condition: tuple[Node, int], side: int
+    nodes: Sequence[Node], roots: Sequence[Node], condition: Array, side: int
 ) -> bool:
     """Move nodes that matter on one side of a condition into a block, if a product is there."""
     always: set[Node] = set()
@@ -145,7 +147,7 @@ def _move_into_block(
     ]
     starts = tuple(node.operands[3 - side] for node in choices)
     captured = {x for node in block for x in node.predecessors} - inside
-    captured |= {condition[0], *nodes_of(starts)}
+    captured |= {condition.node, *nodes_of(starts)}
     if not set(live_nodes(captured)).isdisjoint(choices):
         return False
     ids = itertools.count(max(node.id for node in nodes) + 1)
@@ -159,7 +161,7 @@ def _move_into_block(
         captured=tuple(captured),
         carried=carried,
         results=tuple(flat(node.operands[side], node.size) for node in choices),
-        condition=Array(*condition, 1, (1,)),
+        condition=condition,
         body=tuple(block),
     )
     for node, carry in zip(choices, carried, strict=True):
