@@ -65,6 +65,10 @@ class Run(NamedTuple):
                 return
             yield self.checkpoint(key, partial(compute, index))
 
+    def inside(self, name: str) -> Run:
+        """Return the run with a subfolder, if it has a folder."""
+        return self._replace(folder=self.folder and self.folder / name)
+
     @property
     def batch_options(self) -> BatchOptions:
         """Slots, workers and callback, as keyword arguments of functions that run trials."""

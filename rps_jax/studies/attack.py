@@ -138,8 +138,8 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         set_phase(run.callback, "check in C MuJoCo")
         setting = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
         # A search that continues for longer has other elites.
-        folder = run.folder and run.folder / f"check-{files.sha256(results.u.values.tobytes())[:8]}"
-        probe = Probe(self.ranges, self.params, setting, run._replace(folder=folder))
+        name = f"check-{files.sha256(results.u.values.tobytes())[:8]}"
+        probe = Probe(self.ranges, self.params, setting, run.inside(name))
         batch = max(1, run.workers or device.count_processors())
         for first in range(0, len(order), batch):
             if time.perf_counter() >= deadline:

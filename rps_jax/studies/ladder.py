@@ -137,7 +137,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
         progress = SequentialProgress(run.callback)
         results = {}
         for name, sweep in self.sweeps.items():
-            results[name] = sweep.answer(_run_of(run._replace(callback=progress), name))
+            results[name] = sweep.answer(run._replace(callback=progress).inside(_file_name(name)))
             progress.finish(sweep.plan.num_trials)
         return xr.DataTree.from_dict(results)
 
@@ -149,7 +149,8 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
             return self.sections(self.single, results, run)
         sections = []
         for name, sweep in self.sweeps.items():
-            for section in self.sections(sweep, results[name].to_dataset(), _run_of(run, name)):
+            inner, of_domain = run.inside(_file_name(name)), results[name].to_dataset()
+            for section in self.sections(sweep, of_domain, inner):
                 if picture := section.picture:  # pictures of all domains are in one folder
                     picture = picture._replace(name=f"{picture.name}_{_file_name(name)}")
                 sections.append(section._replace(title=f"{section.title}, {name}", picture=picture))
@@ -161,11 +162,6 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
 
 
 ladder = call_of(Ladder)
-
-
-def _run_of(run: Run, domain: str) -> Run:
-    """Return the run of one domain, in a subfolder."""
-    return run._replace(folder=run.folder and run.folder / _file_name(domain))
 
 
 def _file_name(domain: str) -> str:

@@ -203,13 +203,10 @@ class TuneES(Descent):
 
     def search(self) -> Search:
         """Search by CMA-ES of the package cmaes, or by a descent; `center` is the mean."""
-        if self.estimator != "antithetic":
-            return self._search()
-        rate = self.learning_rate
-        rule = optimiser("fixed_length", "cosine_decay", rate, self.generations)
-        return self.descend(rule, {})
-
-    def _search(self) -> Search:
+        if self.estimator == "antithetic":
+            rate = self.learning_rate
+            rule = optimiser("fixed_length", "cosine_decay", rate, self.generations)
+            yield from self.descend(rule, {})
         seed = int(np.random.SeedSequence((self.setting.seed, 0)).generate_state(1)[0])
         kind = cmaes.SepCMA if self.estimator == "sep_cma" else cmaes.CMA
         strategy = kind(self.base, self.spread, population_size=self.population, seed=seed)

@@ -61,7 +61,7 @@ from rps_jax.tuning import logs as logs_
 from rps_jax.tuning import posterior
 from rps_jax.tuning.logs import Log, RawLog
 from rps_jax.world import domain as domains
-from rps_jax.world import draws, points
+from rps_jax.world import points
 from rps_jax.world.domain import QUANTITIES, VELOCITY_ERRORS, Domain, Range, unit_of
 from rps_jax.world.draws import Draw
 
@@ -302,13 +302,12 @@ class Bank:
 
     def _simulate(self, index: np.ndarray, split: Split, run: Run) -> xr.Dataset:
         """Return coordinates and statistics of the worlds with these indices."""
-        objects, seed = self.domain.object_of(index), seed_of(self.setting.seed, split)
-        groups = [index[objects == i] for i in np.unique(objects)]
-        drawn = [draws.draw(self.domain, seed, group) for group in groups]
+        seed = seed_of(self.setting.seed, split)
+        at, drawn = zip(*points.draw_by_object(self.domain, seed, None, index), strict=True)
         workers = run.workers or self.setting.simulator.workers("cpu")
         with ThreadPoolExecutor(workers) as pool:
             pairs = zip(*pool.map(device.standard_jax()(self.statistics), drawn), strict=True)
-        order = np.argsort(np.concatenate(groups))
+        order = np.argsort(np.concatenate(at))
         ways = [pd.concat(frames).iloc[order] for frames in pairs]
         cube = points.points_of(self.domain, index, seed)
         columns = [points.names(self.domain).index(name) for name in coordinates(self.domain)]

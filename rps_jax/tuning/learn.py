@@ -32,7 +32,7 @@ from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.spec import Spec
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv
-from rps_jax.trials.progress import Bar, Progress, ProgressCallback
+from rps_jax.trials.progress import Bar, Progress, ProgressCallback, Timing
 from rps_jax.trials.setting import Setting, Split
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import collection
@@ -184,7 +184,7 @@ class Learn(PPO, DomainsQuestion):
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         simulated = float(results.simulated[-1]) if results.sizes["update"] else 0.0
-        seconds = results.attrs["run"]
+        times = Timing(results.attrs["compile"], results.attrs["run"], simulated)
         validated = results.to_dataframe().dropna(subset="validation")
         worlds = self.validation * sum(len(domain.objects) for domain in self.domains)
 
@@ -198,8 +198,7 @@ class Learn(PPO, DomainsQuestion):
         text = (
             f"`{run.folder}/policy.npz` is the learned law. {tested}In validation its success is "
             f"{share(max(validated.validation, default=0.0))}; these worlds chose it among the "
-            f"validated laws. Compile {results.attrs['compile']:.1f} s, run {seconds:.1f} s "
-            f"({simulated / max(seconds, 1e-9):.0f} simulated s per s)."
+            f"validated laws. {str(times).capitalize()}."
         )
         rows = [["update", "wall clock", "success in validation", "mean time", "curriculum"]]
         for update, row in validated.iterrows():

@@ -145,13 +145,23 @@ def _pressure(theta: Mapping[str, Array], pads: np.ndarray) -> Array:
     at = at - load @ at
     x, y = (at / jnp.sqrt(load @ jnp.sum(at**2, axis=1))).T
     square, saddle, shear = x * x + y * y, x * x - y * y, 2 * x * y
-    functions = {"ring": square - 1, "tilt_x": x, "tilt_y": y, "saddle": saddle, "shear": shear}
-    functions |= {"cubic_x": x * (square - 2), "cubic_y": y * (square - 2)}
-    functions |= {"trefoil_x": x * saddle - y * shear, "trefoil_y": x * shear + y * saddle}
-    functions |= {"quartic": square * square - 3 * square + 1}
-    functions |= {"quartic_saddle": saddle * (square - 2), "quartic_shear": shear * (square - 2)}
-    functions |= {"quatrefoil_x": saddle**2 - shear**2, "quatrefoil_y": 2 * saddle * shear}
-    logarithm: Any = sum(theta[name] * f for name, f in functions.items() if name in theta)
+    functions = {
+        "ring": square - 1,
+        "tilt_x": x,
+        "tilt_y": y,
+        "saddle": saddle,
+        "shear": shear,
+        "cubic_x": x * (square - 2),
+        "cubic_y": y * (square - 2),
+        "trefoil_x": x * saddle - y * shear,
+        "trefoil_y": x * shear + y * saddle,
+        "quartic": square * square - 3 * square + 1,
+        "quartic_saddle": saddle * (square - 2),
+        "quartic_shear": shear * (square - 2),
+        "quatrefoil_x": saddle**2 - shear**2,
+        "quatrefoil_y": 2 * saddle * shear,
+    }
+    logarithm: Any = sum(theta[name] * f for name, f in functions.items())
     share = load * jnp.exp(jnp.clip(logarithm, -8.0, 8.0))
     return share / share.sum()
 

@@ -31,14 +31,7 @@ from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import (
-    DefaultLaw,
-    LawQuestion,
-    Run,
-    SimulationQuestion,
-    TaskOption,
-    count_true,
-)
+from rps_jax.runs.question import DefaultLaw, LawQuestion, Run, SimulationQuestion, TaskOption
 from rps_jax.spec import Spec
 from rps_jax.trials.progress import Bar, Progress, Timing
 from rps_jax.trials.results import labelled
@@ -334,8 +327,7 @@ class Tuning(DomainsQuestion, LawQuestion[xr.Dataset]):
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         best, worlds = int(results.validation.argmin("generation")), results.sizes["test_world"]
         success = np.nan_to_num(results.validation_success.values)  # NaN without a validation
-        counts = np.rint(worlds * success).astype(int).tolist()
-        rates = [tables.share(count, worlds) for count in counts]
+        rates = [tables.share(round(worlds * rate), worlds) for rate in success]
         totals = (f"{x} {float(results[x].sum()):,.1f} s" for x in TIMES if x in results)
         text = (
             f"{test_sentences(results.test_success)} The worlds have the objects "
@@ -369,7 +361,7 @@ def test_sentences(success: xr.DataArray) -> str:
     """Return sentences on the success (tested, test_world) of start and tuned law."""
     start, tuned = success
     c = statistics.compare(start, tuned)
-    rates = [tables.share(count_true(x.values > 0), x.size) for x in success]
+    rates = [tables.rate(x.values > 0) for x in success]
     better = "better" if c.gained > c.lost else "worse"
     verdict = f"The tuned law is {better}." if c.p < 0.05 else "Too few to tell which is better."
     return (
