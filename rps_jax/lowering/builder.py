@@ -49,6 +49,7 @@ from rps_jax.lowering.graph import (
     live_nodes,
     nodes_of,
     operation_of,
+    positions,
     size_of,
     view_of,
 )
@@ -142,8 +143,8 @@ class GraphBuilder(Target):
         for value in values:
             value_shape = np.shape(value)
             if value_shape != shape and size_of(value_shape) > 1:
-                indices = np.arange(size_of(value_shape)).reshape(value_shape)
-                value = self.gather([value], np.broadcast_to(indices, shape), value)
+                indices = np.broadcast_to(positions(value_shape), shape)
+                value = self.gather([value], indices, value)
             operands.append(flat(value, size))
         return Array(self.node(Call(function), operands, kind, size), shape)
 
@@ -196,8 +197,7 @@ class GraphBuilder(Target):
         shape = np.shape(value)
         index, windows = sliding_windows(self, shape, starts, sizes)
         if is_constant(value):
-            scalars = list(np.reshape(value, -1))
-            value = Array(self.node(Gather(), scalars, kind, len(scalars)), shape)
+            value = GraphBuilder.stack(self, list(np.reshape(value, -1)), kind, shape)
         if value.step != 1 or value.node.size == 1:
             return self.gather([value], windows[0].reshape(sizes), template=value)
         op = DynamicSlice(tuple(map(tuple, (windows + value.first).tolist())))
@@ -292,5 +292,5 @@ def _matrix_indices(value: Value, batch: Sequence[int], summed: Sequence[int]) -
     """Return the flat indices of a factor of a product: (batch, rows, summed)."""
     shape = np.shape(value)
     rows = [i for i in range(len(shape)) if i not in (*batch, *summed)]
-    indices = np.arange(size_of(shape)).reshape(shape).transpose([*batch, *rows, *summed])
+    indices = positions(shape).transpose([*batch, *rows, *summed])
     return indices.reshape([size_of([shape[i] for i in axes]) for axes in (batch, rows, summed)])

@@ -100,6 +100,11 @@ def size_of(shape: Sequence[int]) -> int:
     return int(np.prod(shape, dtype=int))
 
 
+def positions(shape: Sequence[int]) -> np.ndarray:
+    """Return the flat index of each element of an array."""
+    return np.arange(size_of(shape)).reshape(shape)
+
+
 def first_array(types: Sequence[Typed]) -> tuple[int, int]:
     """Return the index and the size of the first array that has numbers."""
     sizes = [size_of(x.shape) for x in types]

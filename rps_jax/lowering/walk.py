@@ -30,6 +30,7 @@ from rps_jax.lowering.graph import (
     is_constant,
     kind_of,
     operation_of,
+    positions,
     size_of,
 )
 
@@ -217,7 +218,7 @@ def _gather(
     start, indices = 0, list(values)
     for i in sources:
         shape = np.shape(values[i])
-        indices[i] = np.arange(start, start + size_of(shape)).reshape(shape)
+        indices[i] = start + positions(shape)
         start += size_of(shape)
     if eqn.primitive.name == "gather":  # its last source is the number for an index out of bounds
         values = [*values, fill_of(eqn.outvars[0].aval.dtype, eqn.params.get("fill_value"))]
@@ -296,8 +297,7 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
     stacked = []
     for i, var in enumerate(body.jaxpr.outvars[carried:]):
         out = jax.ShapeDtypeStruct((length, *var.aval.shape), var.aval.dtype)
-        indices = np.arange(size_of(out.shape)).reshape(out.shape)
-        stacked.append(target.gather([row[i] for row in rows], indices, out))
+        stacked.append(target.gather([row[i] for row in rows], positions(out.shape), out))
     return [*carry, *stacked]
 
 
@@ -305,8 +305,7 @@ def _row(value: Value, step: int, out: Any, target: Target) -> Value:
     """Return the slice of a scanned value in one step."""
     if is_constant(value):
         return np.asarray(value[step])
-    size = size_of(out.shape)
-    return target.gather([value], (step * size + np.arange(size)).reshape(out.shape), out)
+    return target.gather([value], step * size_of(out.shape) + positions(out.shape), out)
 
 
 def _scan_loop(
@@ -344,7 +343,7 @@ def reduced_by_rows(
     """Reduce some axes by a binary operation for each row along them."""
     shape = np.shape(value)
     rest = [i for i in range(len(shape)) if i not in axes]
-    indices = np.transpose(np.arange(size_of(shape)).reshape(shape), [*axes, *rest])
+    indices = np.transpose(positions(shape), [*axes, *rest])
     first, *rows = indices.reshape(-1, *out.shape)
     result = target.gather([value], first, out)
     for row in rows:
@@ -356,8 +355,7 @@ def sliding_windows(
     target: Target, shape: Sequence[int], starts: Values, sizes: Sequence[int]
 ) -> tuple[Value, np.ndarray]:
     """Return the index of the window at a start, clamped, and the indices in each window."""
-    positions = np.arange(size_of(shape)).reshape(shape)
-    windows = np.lib.stride_tricks.sliding_window_view(positions, tuple(sizes))
+    windows = np.lib.stride_tricks.sliding_window_view(positions(shape), tuple(sizes))
     zero = np.zeros((), np.int32)
     index: Value = zero
     for start, count in zip(starts, windows.shape, strict=False):

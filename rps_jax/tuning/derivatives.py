@@ -294,8 +294,7 @@ class Gradients(xr.Dataset):
         Returns:
           `gradient`, `differences` and their relative `error` (law, world, quantity).
         """
-        with jax.enable_x64(True), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with jax.enable_x64(True), warnings.catch_warnings(action="ignore"):
             results, _ = _gradients(self.inputs | {"worlds": worlds}, step, central=True)
         size = np.maximum(np.abs(results.gradient), np.abs(results.secant))
         error = np.abs(results.gradient - results.secant) / size.where(size > 0, 1.0)

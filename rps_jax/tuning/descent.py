@@ -169,9 +169,8 @@ class TuneGrad(Descent):
         """Validate and estimate slopes; or differentiate windows, with both every few steps."""
         none = {"slope": np.nan, "slope_error": np.nan}
         if not proposal["windows"] or generation == self.steps:
-            worlds = self.worlds if generation < self.steps else 0
-            results, slopes = self.try_step(proposal, generation, score, worlds)
-            return {**results, **gradient_results(slopes), **none, "windows": 0.0}
+            slopes = self.try_step(proposal, generation, score, self.steps)
+            return {**slopes, **none, "windows": 0.0}
         vector, moments = jnp.asarray(proposal["vectors"][0]), proposal["moments"]
         times: dict[str, float] = dict.fromkeys(TIMES, 0.0)
         anchor = generation - generation % self.refresh

@@ -69,20 +69,22 @@ class Descent(Tuning):
         return replace(tried, per_world=True), estimate
 
     def try_step(
-        self, proposal: Proposal, generation: int, score: ScoreCandidates, worlds: int
-    ) -> tuple[Results, Estimate]:
-        """Validate the vector (1, p), and estimate its slopes in some worlds, in one batch.
+        self, proposal: Proposal, generation: int, score: ScoreCandidates, steps: int
+    ) -> Results:
+        """Validate the vector (1, p), and estimate its slopes in the same batch.
 
-        Without worlds the slopes are NaN.
+        After the last of the steps the slopes are NaN.
         """
         vector = jnp.asarray(proposal["vectors"][0])
         check = self.validation_candidates(vector)
-        none = jnp.full_like(vector, jnp.nan)
-        if not worlds:
-            return self.step_results(proposal, *score([check])), Estimate(none, none, none)
-        tried, estimate = self.antithetic(vector, generation, worlds)
-        answer, checked = score([tried, check])
-        return self.step_results(proposal, checked), estimate(answer)
+        if generation < steps:
+            tried, estimate = self.antithetic(vector, generation, self.worlds)
+            answer, checked = score([tried, check])
+            slopes = estimate(answer)
+        else:
+            (checked,), none = score([check]), jnp.full_like(vector, jnp.nan)
+            slopes = Estimate(none, none, none)
+        return {**self.step_results(proposal, checked), **gradient_results(slopes)}
 
     def descend(
         self,
@@ -220,9 +222,7 @@ class TuneES(Descent):
 
     def judge(self, proposal: Proposal, generation: int, score: ScoreCandidates) -> Results:
         if self.estimator == "antithetic":
-            worlds = self.worlds if generation < self.generations else 0
-            results, slopes = self.try_step(proposal, generation, score, worlds)
-            return {**results, **gradient_results(slopes)}
+            return self.try_step(proposal, generation, score, self.generations)
         vectors, center = proposal["vectors"], proposal["center"]
         tried = self.candidates(np.vstack([vectors, self.base]), generation)
         candidates, check = score([tried, self.validation_candidates(center)])

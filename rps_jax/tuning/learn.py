@@ -156,7 +156,7 @@ class Learn(PPO, DomainsQuestion):
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
 
-    def environments(self, split: Split = "tune") -> list[PushEnv]:
+    def environments(self, split: Split) -> list[PushEnv]:
         """Return the environments of a split; those for validation have the paper's rules."""
         tune = split == "tune"
         rules, worlds = (self.setting.rules, self.drawn) if tune else (Rules(), self.validation)

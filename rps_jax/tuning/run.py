@@ -57,7 +57,6 @@ DIMS = {
 }
 
 _SHOWN = 100  # rows of the table of parameters in a report
-Domains = DomainLike | Sequence[DomainLike]
 Results = Mapping[str, np.ndarray | Array | float]  # of a generation, by name
 Proposal = Mapping[str, np.ndarray]  # arrays by name, `vectors` (P, p) among them
 # Runs candidates in the worlds of a tuning.
@@ -70,7 +69,7 @@ Search = Generator[Proposal, Mapping[str, np.ndarray], None]
 class DomainsQuestion(TaskOption, SimulationQuestion[xr.Dataset]):
     """Base of the questions for better laws in random worlds of some domains."""
 
-    domain: Domains = ("wide",)
+    domain: DomainLike | Sequence[DomainLike] = ("wide",)
     """Domains of the worlds: their names, or JSON files of ranges; changes follow each, as
     wide,mass=3:10."""
 

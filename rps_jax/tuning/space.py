@@ -21,7 +21,7 @@ from rps_jax.record.files import JsonObject
 SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}  # of RPS
 
 
-def expand_subsets(names: Sequence[str], base: LawParams = RPSParams()) -> tuple[str, ...]:
+def expand_subsets(names: Sequence[str], base: LawParams) -> tuple[str, ...]:
     """Replace the names of subsets by their members; `full` means all parameters with bounds.
 
     The name of a pytree in the parameters, as `weights`, means all of its leaves with bounds.
