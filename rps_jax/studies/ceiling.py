@@ -178,13 +178,17 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         success = np.asarray(outcome.success).reshape(shape)
         cheapest = np.arange(unsolved.size), cost.argmin(axis=1)
         state = state.copy(deep=True)
-        state.offsets.values[unsolved] = plans[cheapest]
-        state["mean"].values[unsolved] = mean
-        state.cost.values[unsolved] = cost[cheapest]
-        state.time.values[unsolved] = np.asarray(outcome.time, float).reshape(shape)[cheapest]
-        state.solved.values[unsolved] = success[cheapest]
+        changed = {
+            "offsets": plans[cheapest],
+            "mean": mean,
+            "cost": cost[cheapest],
+            "time": np.asarray(outcome.time, float).reshape(shape)[cheapest],
+            "solved": success[cheapest],
+        }
         if r == 0:
-            state.alone.values[unsolved] = success[:, 0]
+            changed["alone"] = success[:, 0]
+        for name, values in changed.items():
+            state[name].values[unsolved] = values
         state.rounds.values[unsolved] += 1
         state.trials.values[unsolved] += self.samples
         return state

@@ -82,8 +82,13 @@ class Paper(SimulationQuestion[xr.DataTree]):
         text = f"The target is {reached} at {float(trial.outcome_time):.1f} s."
         fig_6 = Picture("trial", partial(figures.one_trial, trial, push.case.title))
         left_open = "`notebooks/03_paper` lists our readings; `sweeps/paper_reading` infers them."
+        ground, robot = (map("{:g}".format, x) for x in zip(*FRICTION.values(), strict=True))
+        rows = [["", *FRICTION], ["object-ground", *ground], ["object-robot", *robot]]
+        profile = Picture("profile", partial(figures.profile, RPSParams.paper()))
         return [
-            *_setup(),
+            Section("Table I: friction", "As in the paper, by construction.", rows),
+            Section("Fig. 3: the adaptive rate", "", (), profile),
+            _objects(),
             *table.sections(results["table"].to_dataset()),
             Section("Fig. 6: the box to (-2, 0) under S1", text, (), fig_6),
             *hardware.report(results["hardware"].to_dataset(), run),
@@ -92,19 +97,6 @@ class Paper(SimulationQuestion[xr.DataTree]):
 
 
 paper = call_of(Paper)
-
-
-def _setup() -> list[Section]:
-    """Return the sections with Table I, Fig. 3 and Fig. 4."""
-    ground, robot = zip(*FRICTION.values(), strict=True)
-    rows = [["", *FRICTION], ["object-ground", *map("{:g}".format, ground)]]
-    rows.append(["object-robot", *map("{:g}".format, robot)])
-    profile = Picture("profile", partial(figures.profile, RPSParams.paper()))
-    return [
-        Section("Table I: friction", "As in the paper, by construction.", rows),
-        Section("Fig. 3: the adaptive rate", "", (), profile),
-        _objects(),
-    ]
 
 
 def _objects() -> Section:

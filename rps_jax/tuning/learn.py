@@ -294,7 +294,7 @@ class _Learner:
 
     def _validate(self) -> float:
         """Validate the law; return the wall clock of the validation [s]."""
-        start_time = time.perf_counter()
+        start_time = self.elapsed
         actor = self.runner.train.ema
         success, times = jax.device_get(self._evaluate(self._validation_tables, actor))
         self.curve[-1]["validation"] = rate = float(np.mean(success))
@@ -302,7 +302,7 @@ class _Learner:
             self.curve[-1]["validation_time"] = float(np.mean(times[success]))
         if rate >= self.best_rate:
             self.best_rate, self.best = rate, jax.device_get(actor)
-        return time.perf_counter() - start_time
+        return self.elapsed - start_time
 
     # --- checkpoints ---
 
