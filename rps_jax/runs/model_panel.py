@@ -16,7 +16,6 @@ from rps_jax.record import files
 from rps_jax.runs.execution import run_plan
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.run import Run
-from rps_jax.trials.progress import SequentialProgress
 from rps_jax.world.physics import MUJOCO_GROUND, preset
 
 _HALVED = replace(preset(), timestep=0.005)
@@ -57,14 +56,13 @@ def add_models(results: xr.Dataset, plan: Plan, run: Run) -> xr.Dataset:
 
     The run on another model has its own folder in `models`. `models.nc` has all outcomes.
     """
-    by_model, progress = {REQUESTED: results}, SequentialProgress(run.callback)
-    options = run._replace(callback=progress).batch_options
+    (run, progress), by_model = run.in_parts(), {REQUESTED: results}
     progress.finish(plan.num_trials)
     for name, model_plan in model_plans(plan).items():
         if name != REQUESTED:
             safe = "".join(letter if letter.isalnum() else "_" for letter in name)
-            folder = run.folder and run.folder / "models" / safe
-            by_model[name] = run_plan(model_plan, folder, **options)
+            folder = run.inside(f"models/{safe}").folder
+            by_model[name] = run_plan(model_plan, folder, **run.batch_options)
             progress.finish(model_plan.num_trials)
     joined = xr.concat(by_model.values(), "model", coords="minimal", compat="override")
     joined = joined.assign_coords(model=list(by_model))

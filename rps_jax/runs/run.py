@@ -11,7 +11,7 @@ from typing import NamedTuple
 import xarray as xr
 
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.trials.progress import ProgressCallback
+from rps_jax.trials.progress import ProgressCallback, SequentialProgress
 from rps_jax.trials.worlds import BatchOptions
 
 
@@ -64,6 +64,11 @@ class Run(NamedTuple):
             if key not in finished and not proceed(index):
                 return
             yield self.checkpoint(key, partial(compute, index))
+
+    def in_parts(self) -> tuple[Run, SequentialProgress]:
+        """Return the run of successive parts, and their progress, which counts finished parts."""
+        progress = SequentialProgress(self.callback)
+        return self._replace(callback=progress), progress
 
     def inside(self, name: str) -> Run:
         """Return the run with a subfolder, if it has a folder."""

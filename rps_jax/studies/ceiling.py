@@ -36,7 +36,6 @@ from rps_jax.runs.question import DomainQuestion, Rows, count_true
 from rps_jax.studies.gallery import failure_modes
 from rps_jax.trials import score
 from rps_jax.trials.batch import outcomes
-from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import labelled
 from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import Candidates
@@ -142,8 +141,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Search plans round by round; a resumed run loads its finished rounds."""
         state = start = _initial_state(self.world_indices)
-        progress = SequentialProgress(run.callback)
-        run = run._replace(callback=progress)
+        run, progress = run.in_parts()
 
         def unsolved() -> np.ndarray:
             return np.flatnonzero(state.solved.values == 0)

@@ -24,7 +24,6 @@ from rps_jax.robot.skin import SkinLike
 from rps_jax.runs.question import DefaultLaw, Rows
 from rps_jax.studies.table import Table
 from rps_jax.trials import pushes
-from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import labelled, trace_dataset
 from rps_jax.trials.trial import Shift
 from rps_jax.world.domain import name_or_custom
@@ -105,8 +104,7 @@ class Hardware(LawQuestion[xr.Dataset]):
         return sum(self.trial_counts)
 
     def answer(self, run: Run) -> xr.Dataset:
-        progress = SequentialProgress(run.callback)
-        run = run._replace(callback=progress)
+        run, progress = run.in_parts()
         parts = {"hardware": self.table.run_cases, "shifted": self._shove, "paths": self._trace}
         results = []
         for (name, compute), count in zip(parts.items(), self.trial_counts, strict=True):

@@ -26,7 +26,7 @@ from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, 
 from rps_jax.record.files import JsonObject
 from rps_jax.runs.question import Rows, TaskOption, count_true
 from rps_jax.runs.sweep import Sweep, SweepOptions, describe_plan
-from rps_jax.trials.progress import ProgressCallback, SequentialProgress
+from rps_jax.trials.progress import ProgressCallback
 from rps_jax.worlds import DomainLike
 
 REFERENCE = "rps_tuned"  # the law that all others are compared with
@@ -134,10 +134,10 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
         return self.single.execute(callback) if self.single else super().execute(callback)
 
     def answer(self, run: Run) -> xr.DataTree:
-        progress = SequentialProgress(run.callback)
+        run, progress = run.in_parts()
         results = {}
         for name, sweep in self.sweeps.items():
-            results[name] = sweep.answer(run._replace(callback=progress).inside(_file_name(name)))
+            results[name] = sweep.answer(run.inside(_file_name(name)))
             progress.finish(sweep.plan.num_trials)
         return xr.DataTree.from_dict(results)
 

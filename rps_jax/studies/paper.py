@@ -21,7 +21,6 @@ from rps_jax.runs.question import SimulationQuestion
 from rps_jax.studies import table
 from rps_jax.studies.hardware import Hardware
 from rps_jax.studies.table import Table
-from rps_jax.trials.progress import SequentialProgress
 from rps_jax.world import scene, video
 from rps_jax.world.objects import PAPER_OBJECTS
 
@@ -59,8 +58,7 @@ class Paper(SimulationQuestion[xr.DataTree]):
         return sum(part.num_trials() or 0 for part in self.parts)
 
     def answer(self, run: Run) -> xr.DataTree:
-        progress = SequentialProgress(run.callback)
-        run = run._replace(callback=progress)
+        run, progress = run.in_parts()
         tables, push, hardware = self.parts
         results = {"table": tables.answer(run)}
         progress.finish(tables.num_trials() or 0)

@@ -42,8 +42,7 @@ class Probe:
     _progress: SequentialProgress = field(init=False)
 
     def __post_init__(self) -> None:
-        self._progress = SequentialProgress(self.run.callback)
-        self.run = self.run._replace(callback=self._progress)
+        self.run, self._progress = self.run.in_parts()
 
     def __call__(self, u: np.ndarray) -> xr.Dataset:
         """Return outcomes and `severity` (world) at points `u` (n, q)."""
