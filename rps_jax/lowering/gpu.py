@@ -333,15 +333,12 @@ class GpuWriter(SimdWriter):
 
     def _gather(self, node: Node) -> tuple[list[str], str]:
         """Return statements, and the expression of element `i` of a gather."""
-        sources: dict[Node | None, list[int]] = {}
-        for i, a in enumerate(node.operands):
-            sources.setdefault(a.node if isinstance(a, Array) else None, []).append(i)
-        texts, source_of = [], [0] * node.size
-        for k, (source, indices) in enumerate(sources.items()):
-            for i in indices:
-                source_of[i] = k
-            inside = set(indices)  # elsewhere any valid index will do
-            args = [node.operands[i if i in inside else indices[0]] for i in range(node.size)]
+        owners = [a.node if isinstance(a, Array) else None for a in node.operands]
+        sources, texts = list(dict.fromkeys(owners)), []
+        for source in sources:
+            first = node.operands[owners.index(source)]  # elsewhere any valid index will do
+            pairs = zip(node.operands, owners, strict=True)
+            args = [a if owner is source else first for a, owner in pairs]
             if source is None:
                 texts.append(self.operand(np.asarray(args), "i"))
             else:
@@ -355,7 +352,8 @@ class GpuWriter(SimdWriter):
         kind = TYPES[node.kind]
         # All threads take part in each shuffle.
         lines = [f"  const {kind} {n} = {t};" for n, t in zip(names, texts, strict=True)]
-        return [*lines, f"  const int {choice} = {self._integers(source_of)};"], chosen
+        source_of = self._integers([sources.index(owner) for owner in owners])
+        return [*lines, f"  const int {choice} = {source_of};"], chosen
 
     def _integers(self, scalars: Sequence[int]) -> str:
         """Return an expression in `i` of these integers."""

@@ -209,6 +209,5 @@ def _equation(x: Sequence[Tensor], dimensions: Any) -> str:
     for i, j in zip((*lhs, *lhs_batch), (*rhs, *rhs_batch), strict=True):
         b[j] = a[i]
     out = [a[i] for i in lhs_batch]
-    out += [c for i, c in enumerate(a) if i not in (*lhs, *lhs_batch)]
-    out += [c for j, c in enumerate(b) if j not in (*rhs, *rhs_batch)]
+    out += [c for c in (*a, *b) if (c in a) != (c in b)]
     return f"{''.join(a)},{''.join(b)}->{''.join(out)}"

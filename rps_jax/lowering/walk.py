@@ -273,12 +273,12 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
         raise UnsupportedError(f"scan of more than {_MAX_STEPS} steps")
     # Versions of JAX differ in the names of these counts. Carried values have the same shape
     # inside and outside of the body; scanned and stacked values have not.
-    results = zip(eqn.outvars, body.jaxpr.outvars, strict=True)
-    carried = sum(out.aval.shape == inner.aval.shape for out, inner in results)
-    starts = zip(values, body.jaxpr.invars, strict=True)
-    fixed = sum(np.shape(value) == var.aval.shape for value, var in starts) - carried
+    results = zip(_types(eqn.outvars), body.out_avals, strict=True)
+    carried = sum(out.shape == inner.shape for out, inner in results)
+    starts = zip(values, body.in_avals, strict=True)
+    fixed = sum(np.shape(value) == inner.shape for value, inner in starts) - carried
     consts, carry = values[:fixed], values[fixed : fixed + carried]
-    if len(values) == fixed + carried == fixed + len(body.jaxpr.outvars):
+    if len(values) == fixed + carried == fixed + len(body.out_avals):
         loop = target.for_loop(_with_consts(body, consts, target), carry, length)
         if loop is not None:
             return loop
@@ -286,8 +286,7 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
         counts = {"length": length, "fixed": fixed, "carried": carried}
         function = functools.partial(_scan_loop, jaxpr=body, reverse=params["reverse"], **counts)
         return list(_expanded(function, values, _types(eqn.invars), target))
-    scanned = zip(values[fixed + carried :], body.jaxpr.invars[fixed + carried :], strict=True)
-    scanned = [(value, var.aval) for value, var in scanned]
+    scanned = list(zip(values[fixed + carried :], body.in_avals[fixed + carried :], strict=True))
     rows: list[list[Value]] = [[]] * length
     order = range(length)
     for step in reversed(order) if params["reverse"] else order:
@@ -295,8 +294,8 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
         results = _walk(body, [*consts, *carry, *row], target)
         carry, rows[step] = results[:carried], results[carried:]
     stacked = []
-    for i, var in enumerate(body.jaxpr.outvars[carried:]):
-        out = jax.ShapeDtypeStruct((length, *var.aval.shape), var.aval.dtype)
+    for i, inner in enumerate(body.out_avals[carried:]):
+        out = jax.ShapeDtypeStruct((length, *inner.shape), inner.dtype)
         stacked.append(target.gather([row[i] for row in rows], positions(out.shape), out))
     return [*carry, *stacked]
 

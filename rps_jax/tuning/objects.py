@@ -135,7 +135,7 @@ def read_pushes(pushes: PushesLike) -> Pushes:
         rule = "it is {:g} to {:g} m/s: give time in s, tip_x and tip_y in m".format(*_SPEEDS)
         raise errors.not_allowed("speed of the finger", f"{speed:.2g} m/s (median)", rule)
     length = max(map(len, parts))
-    path = [np.concatenate([x[:, 5:], np.repeat(x[-1:, 5:], length - len(x), 0)]) for x in parts]
+    path = [x[np.minimum(np.arange(length), len(x) - 1), 5:] for x in parts]
     return Pushes(np.array(path), *(np.array([x[i, 2:5] for x in parts]) for i in (0, -1)))
 
 
@@ -282,8 +282,8 @@ def _fixed(
     """Return outline, pads and radius, repeated so that many objects share a program."""
     unused = np.repeat(pads[-1:] * [1, 1, 0, 1], max(0, _PADS - len(pads)), axis=0)
     corners = next((n for n in _CORNERS if n >= len(outline)), len(outline))
-    again = np.repeat(outline[-1:], corners - len(outline), axis=0)
-    return np.concatenate([outline, again]), np.concatenate([pads, unused]), radius
+    repeated = outline[np.minimum(np.arange(corners), len(outline) - 1)]
+    return repeated, np.concatenate([pads, unused]), radius
 
 
 def _batched(
@@ -295,10 +295,10 @@ def _batched(
     """
     parts = []
     for first in range(0, len(pushes.path), _BATCH):
-        part = [np.asarray(y, float)[first : first + _BATCH] for y in pushes]
-        count = len(part[0])
-        missing = (_SMALL_BATCH if count <= _SMALL_BATCH else _BATCH) - count
-        part = [jnp.asarray(np.concatenate([y, np.repeat(y[-1:], missing, 0)])) for y in part]
+        count = min(len(pushes.path) - first, _BATCH)
+        size = _SMALL_BATCH if count <= _SMALL_BATCH else _BATCH
+        index = first + np.minimum(np.arange(size), count - 1)
+        part = [jnp.asarray(np.asarray(y, float)[index]) for y in pushes]
         outputs = function(jnp.asarray(x), fixed, *part)
         parts.append([np.asarray(y, float)[:count] for y in outputs])
     first, second = map(np.concatenate, zip(*parts, strict=True))
@@ -365,7 +365,7 @@ def fit(
     """Fit an object to measured pushes: see `FitObject`."""
     corners, data = finger.check_outline(outline), read_pushes(pushes)
     _check(corners, data, radius, prior)
-    mean, deviation = np.array([{**PRIOR, **prior}[name] for name in PRIOR]).T
+    mean, deviation = np.array([*{**PRIOR, **prior}.values()]).T
     pads = finger.uniform_pads(corners) if feet is None else _pads_of(feet)
     fixed, size = _fixed(corners, pads, radius), _half_size(corners)
     turn = size * solid.wrap(data.end[:, 2] - data.start[:, 2])
