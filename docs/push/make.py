@@ -410,7 +410,7 @@ def scripts() -> str:
         "SHORTEST": quantity.declared(path.Path)["length"].low,
         "RECORDED": json.loads(RECORDED.read_text("utf-8")),
     }
-    lines = [f"const {name} = {js.text_of(value)};" for name, value in constants.items()]
+    lines = [f"const {name} = {json.dumps(value)};" for name, value in constants.items()]
     return "\n".join([*lines, js.HELPERS, *tables.values(), *functions])
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -34,7 +33,7 @@ class JsWriter(ScalarWriter):
         return f"const {node.name} = Array({node.size});" if node.size > 1 else f"let {node.name};"
 
     def literal(self, value: float, kind: str) -> str:
-        return text_of(np.asarray(value).item())
+        return json.dumps(np.asarray(value).item())
 
     def array_literal(self, texts: Iterable[str]) -> str:
         return f"[{', '.join(texts)}]"
@@ -42,7 +41,7 @@ class JsWriter(ScalarWriter):
     def table_declaration(self, name: str, array: np.ndarray) -> str:
         """Return a table; a matrix is packed in as few bytes as are exact."""
         if array.ndim < 2:
-            return f"const {name} = {text_of(array.tolist())};"
+            return f"const {name} = {json.dumps(array.tolist())};"
         exact = bool(np.all(array.astype("<f4") == array))
         kind, dtype = ("Float32Array", "<f4") if exact else ("Float64Array", "<f8")
         packed = base64.b64encode(array.astype(dtype).tobytes()).decode()
@@ -76,15 +75,3 @@ def object_of(group: str, groups: Mapping[str, Group]) -> str:
     """Return the results of a routine as an object."""
     fields = ", ".join(f"{field.name}: result_{group}_{field.name}" for field in groups[group])
     return f"{{ {fields} }}"
-
-
-def text_of(value: object) -> str:
-    """Return numbers, texts, lists and mappings as a literal of JavaScript."""
-    if isinstance(value, Mapping):
-        items = (f"{json.dumps(k)}: {text_of(v)}" for k, v in value.items())
-        return "{" + ", ".join(items) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(text_of, value)) + "]"
-    if isinstance(value, float) and not math.isfinite(value):
-        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
-    return json.dumps(value)

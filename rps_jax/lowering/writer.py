@@ -39,6 +39,7 @@ class Writer:
     """Printer of nodes; subclasses define a language."""
 
     index = "int"  # type of a loop's index
+    leave = "if (!any(goes)) break;"  # of a loop, when no lane continues
     prefix = ""  # of all names
 
     def __init__(self) -> None:
@@ -223,7 +224,7 @@ class Writer:
             condition = [n for n in live_nodes([loop.condition.node]) if n in loop.body]
             body += self.lines(condition, loop.body, computed)
             holds = f"{self.declaration('b', 'goes')} = {self.read(loop.condition, 1)};"
-            body += self.statement([holds, "if (!any(goes)) break;"])
+            body += self.statement([holds, self.leave])
             computed |= set(condition)
             rest = [n for n in loop.body if n not in set(condition)]
         body += self.lines(rest, results, computed)

@@ -255,8 +255,7 @@ class Tuning(DomainsQuestion, LawQuestion[xr.Dataset]):
                 raise files.CorruptFileError(run.folder, reason)
             if results.validation < least:
                 best, least = results.center.values, float(results.validation)
-            names = [x for x, v in results.items() if set(v.dims) <= {"parameter"}]
-            row = results[names].drop_vars("center")
+            row = results.drop_dims({*results.dims} - {"parameter"}).drop_vars("center")
             row = row.expand_dims(generation=[count])
             log = xr.concat([log, row], "generation") if count else row
             count, simulated = count + 1, simulated + float(results.simulated)

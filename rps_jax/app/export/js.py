@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 
 from rps_jax.app.export.program import Program
-from rps_jax.lowering.js import HELPERS, object_of, statements, text_of
+from rps_jax.lowering.js import HELPERS, object_of, statements
 from rps_jax.lowering.routine import Group
 
 
@@ -33,5 +35,5 @@ def module(program: Program, prefix: str) -> str:
 
 
 def _values(group: Group) -> str:
-    lines = [f"  {field.name}: {text_of(np.asarray(field.value).tolist())}," for field in group]
+    lines = [f"  {field.name}: {json.dumps(np.asarray(field.value).tolist())}," for field in group]
     return "\n".join(["{", *lines, "}"])
