@@ -24,7 +24,7 @@ from rps_jax.control.registry import LawLike
 from rps_jax.laws import LawParams, LawsLike, law_of, resolve_law
 from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.record.files import JsonObject
-from rps_jax.runs.question import Rows, TaskOption, count_true
+from rps_jax.runs.question import Rows, TaskOption
 from rps_jax.runs.sweep import Sweep, SweepOptions, describe_plan
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.worlds import DomainLike
@@ -248,10 +248,10 @@ def _comparison(results: xr.Dataset) -> list[Section]:
 @styled
 def draw_ladder(results: xr.Dataset) -> Figure:
     """Draw the success of each law, grouped by senses, with Wilson's 95 % intervals."""
-    senses = dict(zip(results.law.values.tolist(), results.senses.values.tolist(), strict=True))
+    senses = results.senses.to_series().to_dict()
     drives = results.get("drives", results.senses).to_series()
     kinds, total = get_args(Senses), results.sizes["world"]
-    counts = {law: count_true(results.success.sel(law=law).values > 0) for law in senses}
+    counts = (results.success > 0).sum("world").to_series().to_dict()
     order = sorted(senses, key=lambda law: (-kinds.index(senses[law]), counts[law]))
     above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center"}
     figure, ax = panel((WIDTH, 0.8 + 0.3 * len(order)), "success [%]", "")

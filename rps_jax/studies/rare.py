@@ -20,6 +20,7 @@ from itertools import zip_longest
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from scipy import stats
 
@@ -221,11 +222,10 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         simulations = [subset_simulation(kinds, self, int(i)) for i in seeds]
         results = run_together(lambda u: probe(u).severity.values, simulations)
         estimates, p_groups, levels, u, severity = zip(*results, strict=True)
-        columns = zip(Estimate._fields, zip(*estimates, strict=True), strict=True)
         depths = list(zip_longest(*levels, fillvalue=np.nan))
         return xr.Dataset(
             {
-                **{name: ("repetition", list(values)) for name, values in columns},
+                **{name: ("repetition", x) for name, x in pd.DataFrame([*estimates]).items()},
                 "p_group": (("repetition", "group"), np.stack(p_groups)),
                 "level": (("repetition", "depth"), np.array(depths).T),
                 "u": (("failure", "quantity"), np.concatenate(u)),

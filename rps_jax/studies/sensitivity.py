@@ -177,8 +177,8 @@ def analyze(options: Sensitivity, sweep: xr.Dataset) -> xr.Dataset:
 
 def rank_factors(results: xr.Dataset) -> list[str]:
     """Return the factors by their total index for success, the greatest first."""
-    total = results.total.sel(output="success")
-    return [str(name) for name in total.factor.values[np.argsort(-total.values, kind="stable")]]
+    total = results.total.sel(output="success").to_series()
+    return total.sort_values(ascending=False, kind="stable").index.tolist()
 
 
 def index_table(results: xr.Dataset) -> Rows:
