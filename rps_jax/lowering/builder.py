@@ -171,7 +171,7 @@ class GraphBuilder(Target):
         constant = [is_constant(value) for value, _ in sides]
         long = constant.index(True) if any(constant) else int(rows[1] > rows[0])
         products = self.products(sides[long], sides[1 - long], out.dtype)
-        indices = np.arange(size_of(out.shape)).reshape(-1, rows[1 - long], rows[long])
+        indices = positions(out.shape).reshape(-1, rows[1 - long], rows[long])
         if long == 0:  # the rows of the left factor come first
             indices = indices.swapaxes(1, 2)
         return self.gather(products, indices.reshape(out.shape), out)

@@ -149,10 +149,6 @@ class TuneGrad(Descent):
             "Derivatives first, then slopes; `rps tune es --estimator antithetic` has slopes alone."
         )
 
-    def _field_as_json(self, name: str) -> object:
-        is_custom = name == "optimiser" and not isinstance(self.optimiser, str)
-        return "custom" if is_custom else super()._field_as_json(name)
-
     def _optimiser(self) -> optax.GradientTransformation:
         return optimiser(self.optimiser, self.schedule, self.learning_rate, self.steps)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,11 @@ import optax
 from jaxtyping import PyTree
 
 from rps_jax import errors
+from rps_jax.record.manifest import Stored
 
-OptimiserLike = str | Any  # name, or a transformation of optax; a text in the command line
+_STORED = Stored(lambda name, _: {name: "custom"}, kinds=(optax.GradientTransformation,))
+# Name, or a transformation of optax; a text in the command line.
+OptimiserLike = Annotated[str | Any, _STORED]
 ScheduleName = Literal[
     "constant", "cosine_decay", "exponential_decay", "linear", "warmup_cosine_decay"
 ]
