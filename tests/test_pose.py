@@ -15,7 +15,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import rps_jax
 from rps_jax import Details, Law, Twist
 from rps_jax.control import registry
-from rps_jax.control.laws.pose import Box, PoseParams, feel
+from rps_jax.control.box import Box, feel
+from rps_jax.control.laws.pose import PoseParams
 from rps_jax.control.observation import EndsObservation, Observation, PoseObservation
 from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.quasistatic import Quasistatic, Slider
@@ -395,7 +396,7 @@ def felt(box, lateral, ends, seen, t_even=1.0):
     signals = jnp.zeros(42), jnp.ones(42, bool)
     obs = EndsObservation(touch, *signals, jnp.array(ends), jnp.array(seen), ~NO, jnp.asarray(0.36))
     inputs = jnp.asarray(-0.5), jnp.asarray(lateral), obs, jnp.asarray(t_even)
-    return feel(PoseParams(), box, *inputs)
+    return feel(PoseParams().r, box, *inputs)
 
 
 def test_a_side_reaches_as_far_as_it_was_felt_until_its_end_is_seen():
