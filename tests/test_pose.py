@@ -15,7 +15,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import rps_jax
 from rps_jax import Details, Law, Twist
 from rps_jax.control import registry
-from rps_jax.control.laws.pose import Box, PoseParams, feel
+from rps_jax.control.box import Box, feel
+from rps_jax.control.laws.pose import PoseParams
 from rps_jax.control.observation import EndsObservation, Observation, PoseObservation
 from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.quasistatic import Quasistatic, Slider
@@ -318,8 +319,8 @@ def pushed(law, weight, K_y, y, x=0.3625):
     params = PoseParams(K_y=K_y)
     truth = jnp.ones((), weight.dtype)
     target = jnp.array([2.0, y])
-    touch = Observation(jnp.zeros(2), jnp.zeros(()), jnp.array([x, 0.0]), truth, target)
-    touch = touch._replace(yaw_target=jnp.zeros(()))
+    inputs = jnp.zeros(2), jnp.zeros(()), jnp.array([x, 0.0]), truth, target
+    touch = Observation(*inputs, yaw_target=jnp.zeros(()))
     ends, seen = jnp.array([0.15, -0.15]), jnp.ones(2, bool)
     signals = jnp.zeros(42), jnp.ones(42, bool)
     obs = EndsObservation(touch, *signals, ends, seen, seen[0], jnp.asarray(0.3625))
@@ -395,7 +396,7 @@ def felt(box, lateral, ends, seen, t_even=1.0):
     signals = jnp.zeros(42), jnp.ones(42, bool)
     obs = EndsObservation(touch, *signals, jnp.array(ends), jnp.array(seen), ~NO, jnp.asarray(0.36))
     inputs = jnp.asarray(-0.5), jnp.asarray(lateral), obs, jnp.asarray(t_even)
-    return feel(PoseParams(), box, *inputs)
+    return feel(0.2346, box, *inputs)
 
 
 def test_a_side_reaches_as_far_as_it_was_felt_until_its_end_is_seen():
@@ -461,8 +462,8 @@ def test_a_planner_solves_what_the_law_or_one_of_its_tries_solves():
 def test_a_law_that_sees_knows_the_box_and_its_ends():
     """It never looks for an end, and it forgets nothing."""
     law, params = registry.law_of(SightParams(PoseParams())), SightParams(PoseParams())
-    touch = Observation(*(jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, 0.1]), ~NO, jnp.zeros(2)))
-    touch = touch._replace(yaw_target=jnp.zeros(()))
+    inputs = jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, 0.1]), ~NO, jnp.zeros(2)
+    touch = Observation(*inputs, yaw_target=jnp.zeros(()))
     corners = np.array([[0.36, -0.2], [0.96, -0.2], [0.96, 0.6], [0.36, 0.6]])
     obs = PoseObservation(touch, jnp.zeros(2), jnp.zeros(()), jnp.asarray(corners))
     state = law.init(params)

@@ -316,16 +316,7 @@ RECIPES: dict[str, Recipe] = {
         f"--seed 640209 --file pose_drive {_MACHINE}",
         cores=10,
     ),
-    "pose_paths": recipe(
-        "rps sweeps/pose/paths.py --cases "
-        + " ".join(
-            f"'paths, {kind} | {base} | 0.2 m/s'"
-            for kind in ("boxes", "prisms")
-            for base in ("omnidirectional", "differential")
-        )
-        + f" 'rooms, boxes | omnidirectional | 0.2 m/s' --worlds 300 {_MACHINE}",
-        cores=30,
-    ),
+    "pose_paths": recipe(f"rps sweeps/pose/paths.py --worlds 300 {_MACHINE}", cores=35),
     "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 300 {_MACHINE}", cores=10),
     **dict.fromkeys(
         ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 10000 {_MACHINE}", gpu=2)

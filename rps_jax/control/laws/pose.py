@@ -71,6 +71,7 @@ from rps_jax.control.base import (
     bounds_of,
     tuned_presets,
 )
+from rps_jax.control.box import FLUSH, Box, extents, feel, turned, unknown_box
 from rps_jax.control.laws.unicycle import MODES, contact_of, turn_around
 from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
 from rps_jax.geometry import planar, solid
@@ -79,11 +80,9 @@ from rps_jax.robot.robot import Robot
 from rps_jax.spec import Spec, document, tunable
 
 PUSH, BACK, AROUND = 0, 1, 2  # modes
-_EDGE = 0.05  # [m] of contact beyond a known end, which contradicts it
-_SAME = 0.03  # [m] by which a face or an end may have moved between two contacts
-_FLUSH, _UNEVEN = 0.4, -1.0  # [s] of even contact, and of uneven contact
+_QUARTER = np.pi / 2  # [rad]
+_UNEVEN = -1.0  # [s] of uneven contact, after which all sides are forgotten
 _DRUM = 40.0  # [s] of a push, after which an object has no face
-_HALF = 0.07, 0.5  # [m] half widths of objects
 _CARROT, _AHEAD = 0.5, 1.0  # [rad] of the aim on the circle: omnidirectional or not
 _PAST = 0.35  # [m] of the front beyond the face, at which an approach has failed
 _HALF_FRONT = 0.29  # [m]
@@ -204,7 +203,6 @@ def init(params: PoseParams, temperatures: Smooth | None = None) -> PoseState:
     zero = jnp.zeros_like(jnp.asarray(params.r, float))
     count, no, point = jnp.zeros((), jnp.int32), zero > 0, jnp.zeros(2, zero.dtype)
     sides = jnp.zeros(4, zero.dtype)
-    names = ("p_world_contact", "p_world_front", "p_world_base")
     return PoseState(*[zero] * len(PoseState._fields))._replace(
         mode=count,
         leg=count,
@@ -213,64 +211,10 @@ def init(params: PoseParams, temperatures: Smooth | None = None) -> PoseState:
         centred=point > 0,
         twist=sides[:3],
         goal=sides[:3],
-        **dict.fromkeys(names, point),
+        **dict.fromkeys(("p_world_contact", "p_world_front", "p_world_base"), point),
         **dict.fromkeys(("touched", "looking", "done", "oriented"), no),
         **dict.fromkeys(("side", "gear"), zero + 1),
     )
-
-
-def _turned(values: Array, leg: Array) -> Array:
-    """Return values (4,) of the four directions, from that of a leg on."""
-    turned = values
-    for k in (1, 2, 3):
-        turned = jnp.where(leg == k, jnp.roll(values, -k), turned)
-    return turned
-
-
-class Box(NamedTuple):
-    """Box that the law remembers, in the frame of the goal or of a leg."""
-
-    h: Array  # (4,) [m] supports ahead, left, behind and right
-    known: Array  # (4,) bool
-    centred: Array  # (2,) bool: along and across
-
-    def turned(self, leg: Array) -> "Box":
-        """Return the box from the direction of a leg on."""
-        centred = jnp.where(leg % 2 == 1, self.centred[::-1], self.centred)
-        return Box(_turned(self.h, leg), _turned(self.known, leg), centred)
-
-
-def feel(
-    params: PoseParams, box: Box, front: Array, lateral: Array, obs: EndsObservation, t_even: Array
-) -> Box:
-    """Compute Q1 to Q3: the box in the frame of the leg, at a contact on the front.
-
-    `front` and `lateral` [m] are the positions of the front along, and of the base across the leg.
-    """
-    (ahead, _, behind, _), known, centred = box
-    sides, was_known = box.h[1::2], known[1::2]
-    flush = obs.even & (t_even > _FLUSH)
-    # The pushed face: the box moves with it, or another face is there and the middle stays.
-    near = -front
-    same = known[2] & (jnp.abs(near - behind) < _SAME)
-    middle = jnp.where(centred[0], (ahead - behind) / 2, front + params.r)
-    mirrored = front + 2 * jnp.clip(middle - front, *_HALF)
-    keeps = known[0] & ~known[2]
-    far = jnp.where(same, ahead + behind - near, jnp.where(keeps, ahead, mirrored))
-    ahead, behind = jnp.where(obs.even, far, ahead), jnp.where(obs.even, near, behind)
-    far_known = known[0] & (same | keeps | ~obs.even)
-    # Its ends, as supports to the left and to the right.
-    felt = (lateral + obs.ends) * jnp.array([1.0, -1.0])
-    seen = obs.seen & flush
-    is_known = was_known & (felt < sides + _EDGE)
-    is_same = is_known & (jnp.abs(felt - sides) < _SAME)
-    measured = jnp.where(is_same, sides + 0.1 * (felt - sides), felt)
-    unknown = jnp.where(centred[1], jnp.maximum(sides, felt), felt)
-    sides = jnp.where(seen, measured, jnp.where(is_known, sides, unknown))
-    left, right = is_known | seen
-    known = jnp.stack([far_known, left, known[2] | flush, right])
-    h = jnp.stack([ahead, sides[0], behind, sides[1]])
-    return Box(h, known, centred | jnp.stack([False, flush]))
 
 
 def filtered_pose(params: PoseParams, state: PoseState, obs: Observation) -> tuple[Array, Array]:
@@ -309,9 +253,9 @@ def step(
     if is_relative:  # a leg straight ahead until a face is flush
         theta = jnp.where(oriented | state.touched, state.goal[2], planar.wrap(yaw - jnp.pi))
         leg = jnp.where(oriented, leg, 2)
-    touches = weight if weight.dtype == bool else weight > 0.5
+    touches = weight > 0.5
     u = planar.unit(yaw)
-    grid = planar.unit(theta + jnp.arange(4) * (jnp.pi / 2))  # (4, 2) d_j
+    grid = planar.unit(theta + jnp.arange(4) * _QUARTER)  # (4, 2) d_j
     p_world_front = base + half_length * u
     flat = touch._replace(
         p_world_robot=base, yaw=yaw, in_contact=touches, base_radius=None, half_length=half_length
@@ -322,7 +266,7 @@ def step(
     p_world_contact = base + planar.rotate(yaw, contact)
     first, touched = touches & ~state.touched, state.touched | touches
     time, t_lost = state.time + touch.period, jnp.where(touches, 0.0, state.t_lost + touch.period)
-    psi = theta + leg * (jnp.pi / 2)
+    psi = theta + leg * _QUARTER
     pushing = state.mode == PUSH
     is_facing = jnp.abs(planar.wrap(psi - yaw)) < _TURNS
     feels = pushing & touches & on_front & is_facing & state.touched
@@ -334,24 +278,24 @@ def step(
         feels & (state.t_lost < 0.1), grid @ (p_world_front - state.p_world_front), 0.0
     )
     fronts, bases = grid @ (p_world_front - goal), grid @ (base - goal)
-    along, across = _turned(fronts, leg)[:2]
+    along, across = turned(fronts, leg)[:2]
     box = Box(h, state.known, state.centred)
-    felt = feel(params, box.turned(leg), along, across, obs, t_even).turned(-leg % 4)
+    felt = feel(params.r, box.turned(leg), along, across, obs, t_even).turned(-leg % 4)
     middle = p_world_contact + params.r * planar.unit(yaw + normal)
     forgets = (first & ~jnp.any(state.known)) | (feels & (t_even <= _UNEVEN))
-    square = Box(grid @ (middle - goal) + params.r, jnp.zeros(4, bool), jnp.zeros(2, bool))
+    square = unknown_box(grid @ (middle - goal) + params.r)
     h, known, centred = soft.tree_where(forgets, square, soft.tree_where(feels, felt, box))
 
     grows = touches & ~known
     h = jnp.where(grows, jnp.maximum(h, grid @ (p_world_contact - goal)), h)
 
     # Q4 and Q5.
-    y, way, way_left = (h[1] - h[3]) / 2, h[2], -fronts[0]
+    (_, y), (_, width) = extents(h)
+    way, way_left = h[2], -fronts[0]
     both = known[1] & known[3]
     last_leg = leg == 0
     s_min = jnp.where(jnp.any(known), params.s_flush, params.s_min)
     # Q10: the sharpest turn.
-    width = jnp.clip((h[1] + h[3]) / 2, *_HALF)
     kappa = params.turn * jnp.minimum(width, _HALF_FRONT) / (width**2 + params.r**2)
     bend = params.reach * kappa / 4 if omni else 0.0
 
@@ -385,18 +329,18 @@ def step(
     leg_next = jnp.where((way < s_min) & ~is_off & ~is_beside, 2, sideways)
     leg = jnp.where(chooses, leg_next, leg)
     tries = state.tries + repeats
-    psi = theta + leg * (jnp.pi / 2)
+    psi = theta + leg * _QUARTER
     face = planar.wrap(psi - yaw)
     turns = chooses & (jnp.abs(face) > (_TURNS if omni else 0.3))
     last_leg = leg == 0
 
     # The box from the leg, and Q9.
-    ahead, box_left, behind, box_right = _turned(h, leg)
-    along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
-    middle_across, middle_along = (box_left - box_right) / 2, (ahead - behind) / 2
+    _, box_left, behind, box_right = turned(h, leg)
+    along, across = turned(fronts, leg)[0], turned(bases, leg)[1]
+    (middle_along, middle_across), half = extents(turned(h, leg))
     wants = (leg % 2 == 0) & feels & ~chooses & (t_even > 0.6) & ~has_looked
     wants &= (~last_leg | (way_left > 0.03)) & (state.t_push > 0.6)
-    knows_left = _turned(known, leg)[1]
+    knows_left = turned(known, leg)[1]
     target = jnp.where(knows_left, -box_right - params.beyond, box_left + params.beyond)
     look = jnp.where(wants, target, state.look)
     looking = (state.looking & ~(feels & (state.t_push > 0.5)) & ~turns) | wants
@@ -407,7 +351,7 @@ def step(
     # Q7: the end of a push.
     edge = jnp.where(t_even > 0, params.l_edge, params.l_turn)
     is_bad = ~on_front | ((jnp.abs(offset) > edge) & (~last_leg | (way_left > 0.2)))
-    t_push = jnp.where(pushing, state.t_push + jnp.where(touches, touch.period, 0.0), 0.0)
+    t_push = jnp.where(pushing, state.t_push + touches * touch.period, 0.0)
     is_lost = (t_lost > 0.6) & (state.t_push > 0)
     failed = pushing & touched & (state.t_push == 0) & ~touches & (along > _PAST - behind)
     # Nothing is felt there: the object lies ahead, perhaps at a dead taxel.
@@ -426,7 +370,7 @@ def step(
     is_clear = (state.mode == BACK) & ((gap > back) | (at_side & (t_lost > 2)))
 
     # Q8, of the base's middle or of its axle.
-    ahead_u, left_u = planar.unit(psi), planar.unit(psi + jnp.pi / 2)
+    ahead_u, left_u = planar.unit(psi), planar.unit(psi + _QUARTER)
     m = goal + middle_along * ahead_u + aim_across * left_u
     p_world_axle = base - axle * u
     away = p_world_axle - m
@@ -436,10 +380,8 @@ def step(
     carrot = _CARROT if omni else _AHEAD
     behind_face = omni & (jnp.abs(face) < 0.1) & (along < -behind - 0.02) & (jnp.abs(offset) < 0.7)
     is_direct = (jnp.abs(turn) < carrot) | behind_face if omni else turn < carrot
-    half_along = jnp.clip((ahead + behind) / 2, *_HALF)
-    half_across = jnp.clip((box_left + box_right) / 2, *_HALF)
-    R_s = half_along + half_length + params.gap + axle
-    R = params.R + jnp.hypot(half_along, half_across) + axle
+    R_s = half[0] + half_length + params.gap + axle
+    R = params.R + jnp.hypot(*half) + axle
     staging = m - jnp.where(behind_face, -jnp.sum(away * ahead_u), R_s) * ahead_u
     aim = jnp.where(is_direct, staging, m + R * planar.unit(phi + side * carrot))
     to_aim = aim - p_world_axle
@@ -452,7 +394,7 @@ def step(
         half_turns = jnp.array([0.0, jnp.pi])  # forwards and in reverse
         errors = planar.wrap(heading + half_turns - yaw)
         ends = jnp.abs(planar.wrap(psi - heading - half_turns))
-        costs = jnp.abs(errors) + jnp.where(is_direct, ends, jnp.pi / 2)
+        costs = jnp.abs(errors) + jnp.where(is_direct, ends, _QUARTER)
         gear = jnp.where(costs[1] < costs[0] + 1.3, -1.0, 1.0)
         gear = jnp.where(state.mode == AROUND, state.gear, gear)
         error = jnp.where(gear > 0, *errors)
@@ -514,7 +456,7 @@ def step(
     v_y = v_y if omni else v_y + axle * omega
     twist = Twist(v, v_y, omega).saturate(v_max, omega_max)
     if is_relative:
-        orients = feels & ~oriented & ((t_even > _FLUSH) | (state.t_push > _DRUM))
+        orients = feels & ~oriented & ((t_even > FLUSH) | (state.t_push > _DRUM))
         theta = jnp.where(orients, planar.wrap(yaw + yaw_target), theta)
         oriented, touched, known = oriented | orients, touched & ~orients, known & ~orients
     distance = planar.norm(jnp.stack([way_left, y]))
@@ -556,10 +498,10 @@ def is_done(state: PoseState) -> Array:
 def memory(state: PoseState) -> Memory:
     """Return the mode and the middle of the box."""
     mode = ("", *MODES[:2])[int(state.mode)]
-    ahead, left, behind, right = state.h
-    goal, middle = np.asarray(state.goal), np.array([ahead - behind, left - right]) / 2
-    middle = goal[:2] + solid.rotate(goal[2], middle)
-    return Memory(mode, middle) if state.touched else Memory(mode)
+    if not state.touched:
+        return Memory(mode)
+    goal = np.asarray(state.goal)
+    return Memory(mode, goal[:2] + solid.rotate(goal[2], np.asarray(extents(state.h)[0])))
 
 
 LAW = Law(
