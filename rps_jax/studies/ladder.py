@@ -203,8 +203,8 @@ class Score(Ladder, _ScoredLaw):
     def chosen(self) -> dict[str, LawParams]:
         label, params = resolve_law(self.law)
         scored = {label: registry.check_params(params)}
-        beside = self.laws or self.suited_laws(("rps", "rps_plus"))
-        return scored | registry.resolve_laws(beside) | scored
+        others = self.laws or self.suited_laws(("rps", "rps_plus"))
+        return scored | registry.resolve_laws(others) | scored
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
         sections = super().sections(sweep, results, run)

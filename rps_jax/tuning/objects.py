@@ -91,9 +91,9 @@ class Pushes(NamedTuple):
         pose = self.end if at_end else self.start
         points = solid.rotate(-pose[:, 2], self.path[:, -at_end] - pose[:, :2])
         p, a = (points @ (1, 1j))[:, None], np.asarray(outline) @ (1, 1j)
-        ends = a, np.roll(a, -1)
-        away = polyline.to_segment(p, *ends).min(axis=1)
-        return np.where(polyline.is_inside(p, *ends), -away, away) - radius
+        edges = a, np.roll(a, -1)
+        away = polyline.to_segment(p, *edges).min(axis=1)
+        return np.where(polyline.is_inside(p, *edges), -away, away) - radius
 
 
 PushesLike = str | Path | pd.DataFrame | Pushes
