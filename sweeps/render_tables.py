@@ -53,10 +53,6 @@ STALE: dict[str, str] = {
         ("engines_ideal", "engines_wide", "tasks_parity"),
         "objects got supports, with other last bits of C MuJoCo",
     ),
-    **dict.fromkeys(
-        ("pose", "pose_failures", "pose_sight"),
-        "`pose_drive` was tuned by evolution, which changes the differential base",
-    ),
     "plus": "the ladder, whose small run tells of changes, got more laws",
     **dict.fromkeys(
         (
@@ -78,7 +74,7 @@ STALE: dict[str, str] = {
     ),
     "fit_one_push": "a sum in the solver got its former order back, with other last bits",
     **dict.fromkeys(
-        ("learned_windows", "million"),
+        ("learned_windows",),
         "`learned` was trained between walls, too",
     ),
 }
