@@ -67,6 +67,22 @@ _RANDOM = {
     "random_split": "split",
     "random_fold_in": "fold_in",
 }
+# Operations on whole numbers and bools that are the same in NumPy.
+_FOLDED = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "neg": np.negative,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+}
 _IDENTITIES = (
     "stop_gradient",
     "copy",
@@ -259,6 +275,13 @@ def _fold(eqn: JaxprEqn, arrays: list[Value]) -> list[Value]:
         return [np.transpose(arrays[0], params["permutation"])]
     if name == "rev":
         return [np.flip(arrays[0], params["dimensions"])]
+    if name in _FOLDED and all(x.dtype.kind in "iub" for x in arrays):
+        with np.errstate(over="ignore"):
+            return [np.asarray(_FOLDED[name](*arrays))]
+    if name == "iota":
+        axis = params["dimension"]
+        column = np.arange(shape[axis], dtype=out.dtype).reshape(-1, *[1] * len(shape[axis + 1 :]))
+        return [np.broadcast_to(column, shape)]
     result = eqn.primitive.bind(*map(jnp.asarray, arrays), **params)
     results = result if eqn.primitive.multiple_results else [result]
     return [x if _is_key(x) else np.asarray(x) for x in results]
