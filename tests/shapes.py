@@ -25,41 +25,59 @@ MODULES = [
 CONF = BeartypeConf(is_pep484_tower=True)  # a whole number is a float
 
 
+JAXTYPED = jaxtyping.jaxtyped
+
+
 def install():
     """Check the calls of `MODULES`; call this before they are imported."""
     jaxtyping.install_import_hook(MODULES, "shapes.checked")
+    jaxtyping.jaxtyped = checked_once  # the decorator that the hook writes
+
+
+def checked_once(typechecker):
+    """Return a decorator by which jaxtyping checks a call with new types or shapes."""
+
+    def decorate(function):
+        check, passed = JAXTYPED(typechecker=typechecker)(function), set()
+
+        @functools.wraps(function)
+        def call(*args, **kwargs):
+            if (key := types_of((args, kwargs))) in passed:
+                return function(*args, **kwargs)
+            result = check(*args, **kwargs)
+            passed.update([key] if key else [])
+            return result
+
+        return check if isinstance(function, type) else call
+
+    return decorate
+
+
+def types_of(arguments):
+    """Return a key that calls with equal types and shapes share; None if there is none."""
+    try:
+        leaves, tree = jax.tree.flatten(arguments)
+        key = tree, *((type(x), getattr(x, "shape", 0), getattr(x, "dtype", 0)) for x in leaves)
+        hash(key)
+    except (AttributeError, TypeError):  # a record without its fields, or with static arrays
+        return None
+    return key
 
 
 def checked(function):
     """Return a function whose calls are checked; jaxtyping calls this decorator."""
     inner, signature = beartype(conf=CONF)(function), inspect.signature(function)
     typed = {name for name, item in signature.parameters.items() if item.annotation is not Any}
-    passed = set()
 
     @functools.wraps(function)
     def call(*args, **kwargs):
-        if (key := types_of((args, kwargs))) in passed:
-            return function(*args, **kwargs)
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             for item in value if type(value) is tuple else (value,):
-                with jaxtyping.jaxtyped("context"):  # `*B` is of one record
+                with JAXTYPED("context"):  # `*B` is of one record
                     look(item if name in typed else None)
-        result = inner(*args, **kwargs)
-        passed.update([key] if key else [])
-        return result
+        return inner(*args, **kwargs)
 
     return call
-
-
-def types_of(arguments: Any) -> Any:
-    """Return a key that calls with equal types and shapes share; None if there is none."""
-    try:
-        leaves, tree = jax.tree.flatten(arguments)
-        key = tree, tuple((type(x), getattr(x, "shape", 0), getattr(x, "dtype", 0)) for x in leaves)
-        hash(key)
-    except (AttributeError, TypeError):  # a record without its fields, or with static arrays
-        return None
-    return key
 
 
 def look(value: Any) -> None:
