@@ -144,11 +144,11 @@ class Writer:
             groups: dict[int, list[Node]] = {}
             ready = set[Node]()
             for node, needed in waiting.items():
-                node_kind = "fused" if self.is_fusible(node) else "single"
-                node_kind = "loop" if isinstance(node, LoopNode) else node_kind
+                is_loop, is_fused = isinstance(node, LoopNode), self.is_fusible(node)
+                node_kind = "loop" if is_loop else "fused" if is_fused else "single"
                 if node_kind != kind or not needed <= ready:
                     continue
-                if kind == "fused" and not needed.isdisjoint(node.fusion_barriers):
+                if is_fused and needed & node.fusion_barriers:
                     continue
                 if kind == "loop":
                     return [node]
