@@ -107,15 +107,19 @@ def _types_of_operands(node: Node) -> list[tuple[str, int]]:
 
 def _check_region(nodes: Iterable[Node], defined: set[Node]) -> None:
     """Check nodes, which read one another and the nodes that are `defined` outside."""
-    waiting = list(nodes)
+    waiting, defined = list(nodes), set(defined)
     while waiting:
-        ready = [x for x in waiting if defined.issuperset(x.predecessors)]
-        unknown = sorted({x.name for x in waiting[0].predecessors if x not in defined})
-        _require(bool(ready), waiting[0], f"it reads {', '.join(unknown)} before the definition")
-        for node in ready:
-            _check_node(node)
-        defined = defined | set(ready)
-        waiting = [x for x in waiting if x not in defined]
+        late = list[Node]()
+        for node in waiting:
+            if defined.issuperset(node.predecessors):
+                _check_node(node)
+                defined.add(node)
+            else:
+                late.append(node)
+        unknown = ", ".join(sorted({x.name for x in waiting[0].predecessors if x not in defined}))
+        fault = f"it reads {unknown} before the definition"
+        _require(len(late) < len(waiting), waiting[0], fault)
+        waiting = late
 
 
 def _check_node(node: Node) -> None:

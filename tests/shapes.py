@@ -1,7 +1,7 @@
 """The checker of shapes and types that the tests add to the calls of some modules.
 
 beartype looks into arguments and results, and `checked` into the fields of the records among
-them, too. A program is traced once and runs many times, and so is a call checked once.
+them, too. A call is checked once for each set of types and shapes.
 """
 
 import functools
@@ -9,6 +9,7 @@ import inspect
 import typing
 from typing import Any
 
+import jax
 import jaxtyping
 from beartype import BeartypeConf, beartype
 from beartype.door import is_bearable
@@ -24,9 +25,43 @@ MODULES = [
 CONF = BeartypeConf(is_pep484_tower=True)  # a whole number is a float
 
 
+JAXTYPED = jaxtyping.jaxtyped
+
+
 def install():
     """Check the calls of `MODULES`; call this before they are imported."""
     jaxtyping.install_import_hook(MODULES, "shapes.checked")
+    jaxtyping.jaxtyped = checked_once  # the decorator that the hook writes
+
+
+def checked_once(typechecker):
+    """Return a decorator by which jaxtyping checks a call with new types or shapes."""
+
+    def decorate(function):
+        check, passed = JAXTYPED(typechecker=typechecker)(function), set()
+
+        @functools.wraps(function)
+        def call(*args, **kwargs):
+            if (key := types_of((args, kwargs))) in passed:
+                return function(*args, **kwargs)
+            result = check(*args, **kwargs)
+            passed.update([key] if key else [])
+            return result
+
+        return check if isinstance(function, type) else call
+
+    return decorate
+
+
+def types_of(arguments):
+    """Return a key that calls with equal types and shapes share; None if there is none."""
+    try:
+        leaves, tree = jax.tree.flatten(arguments)
+        key = tree, *((type(x), getattr(x, "shape", 0), getattr(x, "dtype", 0)) for x in leaves)
+        hash(key)
+    except (AttributeError, TypeError):  # a record without its fields, or with static arrays
+        return None
+    return key
 
 
 def checked(function):
@@ -38,7 +73,7 @@ def checked(function):
     def call(*args, **kwargs):
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             for item in value if type(value) is tuple else (value,):
-                with jaxtyping.jaxtyped("context"):  # `*B` is of one record
+                with JAXTYPED("context"):  # `*B` is of one record
                     look(item if name in typed else None)
         return inner(*args, **kwargs)
 

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from helpers import SLOTS
 
 import rps_jax
 from rps_jax import Rules, Setting
@@ -101,11 +102,11 @@ def test_pushes_and_exports_without_a_law_have_one_for_the_base(drive, law, tmp_
 
 def test_the_ladder_and_the_score_use_the_laws_that_the_base_can_follow():
     robot = ROBOTS["differential"]
-    options = {"domain": DRUMS, "worlds": 2, "robot": robot, "setting": BRIEF}
-    scored = rps_jax.score("unicycle,r=0.2", **options)
+    options = {"domain": DRUMS, "worlds": 2, "setting": BRIEF, "slots": SLOTS}
+    scored = rps_jax.score("unicycle,r=0.2", robot=robot, **options)
     assert scored.law.values.tolist() == ["unicycle,r=0.2", "unicycle"]
     known = registry.laws_for("differential")
-    laws = rps_jax.ladder(("unicycle", "rps"), DRUMS, worlds=2, setting=BRIEF)
+    laws = rps_jax.ladder(("unicycle", "rps"), **options)
     assert laws.drives.values.tolist() == ["omni differential car", "omni"]
     assert set(Ladder(robot=robot).chosen) == set(known)
 

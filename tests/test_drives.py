@@ -108,7 +108,7 @@ def test_the_axle_does_not_move_sideways(name, engine):
     "law", [x for x, params in registry.LAWS.items() if "car" in registry.law_of(params).drives]
 )
 def test_no_law_moves_the_axle_sideways(law):
-    qpos = trace(Case(law=law, robot=DIFFERENTIAL, target=(0.5, 1.5)), "fused", 30.0)
+    qpos = trace(Case(law=law, robot=DIFFERENTIAL, target=(0.5, 1.5)), "fused", 12.0)
     _, aside, omega = motion_of_axle(qpos, DIFFERENTIAL.axle)
     assert np.abs(aside).max() < 1e-4
     assert np.abs(omega).max() > 0.05
@@ -385,7 +385,7 @@ def test_a_target_far_aside_ends_a_push_at_once():
 
 def test_repositions_are_counted_with_their_time_and_way():
     """By hand, from the readings of each control step of a push that repositions."""
-    setting = Setting(rules=Rules(horizon=60.0))
+    setting = Setting(rules=Rules(horizon=30.0))
     batch = pushes.build([Case(law="unicycle", robot=DIFFERENTIAL, target=(0.5, 1.5))], setting)
     trajectory = pushes.record_batch(batch, setting, interval=PERIOD)[0]
     snapshots, outcome = trajectory.snapshots, trajectory.outcome

@@ -89,7 +89,7 @@ def test_no_command_meets_the_worlds_of_a_tuner(monkeypatch):
     commands = {name: question_type(name) for name in known()}
     seeded = {k for k, kind in commands.items() if "setting" in {f.name for f in fields(kind)}}
     tuned, validated, rest = set(), set(), set()
-    for seed in (0, 1, 2, 3, 7, 2**32 - 1):
+    for seed in (0, 1, 2**32 - 1):
         setting = Setting(seed=seed)
         for name in TUNERS:
             tune, validate = tuner_keys(commands[name](setting=setting))

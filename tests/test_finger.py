@@ -74,22 +74,28 @@ def test_a_stuck_contact_turns_the_object_with_the_least_power():
     assert_allclose(pushed.pose[0, -1, 2], 0.001 / 0.09, rtol=0.02)
 
 
+@jax.jit
+def moved_ends(s, slider, direction, path, pose):
+    """Return the ends (n, 3) of pushes of a slider moved by `s` along a direction, and slopes."""
+
+    def ends(s):
+        moved = jax.tree.map(lambda x, way: x + s * way, slider, direction)
+        return finger.push(moved, path, pose, 20).pose[:, -1]
+
+    return jax.jvp(ends, (s,), (jnp.ones_like(s),))
+
+
 @pytest.mark.parametrize("name", ["outline", "pads", "friction", "radius"])
 def test_derivatives_are_those_of_differences(name):
-    path, pose = random_pushes(SQUARE, 12, seed=3)
+    pushes = random_pushes(SQUARE, 12, seed=3)
     with jax.enable_x64(True):
-        slider = slider_of(SQUARE)
-        value = getattr(slider, name)
-        way = jnp.asarray(np.random.default_rng(1).normal(size=value.shape))
+        slider = jax.tree.map(np.asarray, slider_of(SQUARE))
+        way = np.random.default_rng(1).normal(size=np.shape(getattr(slider, name)))
         way = way * (1e-3 if name != "friction" else 0.1)
-
-        def ends(s):
-            moved = slider._replace(**{name: value + s * way})
-            return finger.push(moved, jnp.asarray(path), jnp.asarray(pose), 20).pose[:, -1]
-
-        exact = jax.jvp(ends, (0.0,), (1.0,))[1]
+        direction = jax.tree.map(np.zeros_like, slider)._replace(**{name: way})
         step = 1e-4
-        slope = (ends(step) - ends(-step)) / (2 * step)
+        run = [moved_ends(s, slider, direction, *pushes) for s in (0.0, step, -step)]
+        exact, slope = np.array(run[0][1]), np.array(run[1][0] - run[2][0]) / (2 * step)
     assert_allclose(exact, slope, rtol=1e-3, atol=1e-3 * float(np.abs(slope).max()))
 
 

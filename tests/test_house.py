@@ -193,7 +193,7 @@ def test_examples_of_extensions_work_on_the_command_line(extensions):
     shell = "-m", "rps_jax", *files, "sweep"
     helped = process(extensions, *shell, "--help")
     assert "quasistatic,dummy}" in re.sub(r"\s", "", helped)
-    options = "--worlds 4 --horizon 0.3 --engine dummy --task band --out run"
+    options = "--worlds 8 --horizon 0.3 --engine dummy --task band --out run"
     domain = "wide,objects=random_cylinder,threshold=0.1:0.5"
     laws = "my_law.py:AheadParams,gain=0.2"
     process(extensions, *shell, "--laws", laws, "--domain", domain, *options.split())

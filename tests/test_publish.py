@@ -303,12 +303,12 @@ def test_the_code_of_the_page_reads_a_million_outcomes(tmp_path, monkeypatch, ca
     setting = Setting("quasistatic", rules=Rules(horizon=16.0), seed=37)
     near = "wide,objects=random_cylinder,distance=0.7:0.8,bearing=0:0.1"
     laws, out = ("rps", "nps"), tmp_path / "run"
-    study = million.Million(laws, near, 19, setting=setting, slots=32, out=out)
+    study = million.Million(laws, near, 19, setting=setting, slots=8, out=out)
     results = study()
     files.write_results(tmp_path / "million.nc", million.packed(results))
     seeded = replace(setting, seed=seed_of(37, "test"))
     assert results.attrs["seed"] == seeded.seed  # with which the page draws the worlds again
-    swept = sweep(laws, near, 19, setting=seeded, slots=32)
+    swept = sweep(laws, near, 19, setting=seeded, slots=8)
     bits = np.unpackbits(results.success.values, axis=1, count=19)
     assert_array_equal(bits, swept.success)
     assert_array_equal(results.how == 0, swept.success)

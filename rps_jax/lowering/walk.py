@@ -8,6 +8,7 @@ a target, `gather`: they are applied to flat indices, which gives the source of 
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -68,6 +69,8 @@ _RANDOM = {
     "random_split": "split",
     "random_fold_in": "fold_in",
 }
+# Operations of `operator` that NumPy does as JAX on whole numbers and bools.
+_FOLDED = ("add", "sub", "mul", "neg", "lt", "le", "gt", "ge", "eq")
 _IDENTITIES = (
     "stop_gradient",
     "copy",
@@ -235,17 +238,15 @@ def _fold(eqn: JaxprEqn, arrays: list[Value]) -> list[Value]:
     name, params, out = eqn.primitive.name, eqn.params, eqn.outvars[0].aval
     shape: Shape = out.shape
     if name == "broadcast_in_dim":
-        sizes, axes = iter(np.shape(arrays[0])), params["broadcast_dimensions"]
-        aligned = [next(sizes) if i in axes else 1 for i in range(len(shape))]
-        return [np.broadcast_to(np.reshape(arrays[0], aligned), shape)]
+        added = [i for i in range(len(shape)) if i not in params["broadcast_dimensions"]]
+        return [np.broadcast_to(np.expand_dims(arrays[0], added), shape)]
     if name in ("reshape", "squeeze", "expand_dims"):
         return [np.reshape(arrays[0], shape)]
     if name == "convert_element_type" and (arrays[0].dtype.kind, out.dtype.kind) != ("f", "i"):
         return [np.asarray(arrays[0]).astype(params["new_dtype"])]
     if name == "slice":
-        limits = zip(params["start_indices"], params["limit_indices"], strict=True)
-        steps = params["strides"] or (1,) * len(shape)
-        return [arrays[0][tuple(slice(*ab, c) for ab, c in zip(limits, steps, strict=True))]]
+        limits = params["start_indices"], params["limit_indices"]
+        return [arrays[0][tuple(map(slice, *limits, params["strides"] or [1] * len(shape)))]]
     if name in ("concatenate", "stack"):
         axis = params.get("dimension", params.get("axis"))
         return [getattr(np, name)(arrays, axis)]
@@ -260,6 +261,9 @@ def _fold(eqn: JaxprEqn, arrays: list[Value]) -> list[Value]:
         return [np.transpose(arrays[0], params["permutation"])]
     if name == "rev":
         return [np.flip(arrays[0], params["dimensions"])]
+    if name in _FOLDED and arrays[0].dtype.kind in "iub":
+        with np.errstate(over="ignore"):
+            return [np.asarray(getattr(operator, name)(*arrays))]
     result = eqn.primitive.bind(*map(jnp.asarray, arrays), **params)
     results = result if eqn.primitive.multiple_results else [result]
     return [x if _is_key(x) else np.asarray(x) for x in results]

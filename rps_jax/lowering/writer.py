@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
@@ -116,11 +116,14 @@ class Writer:
           live_out: nodes that are read after all groups.
           computed: nodes that are computed before.
         """
-        waiting, order = list(nodes), list[list[Node]]()
+        waiting = {node: {*node.predecessors} - computed for node in nodes}
+        order = list[list[Node]]()
         while waiting:
-            order.append(self._next_group(waiting, computed))
-            computed = computed.union(order[-1])
-            waiting = [node for node in waiting if node not in computed]
+            order.append(self._next_group(waiting))
+            for node in order[-1]:
+                del waiting[node]
+            for needed in waiting.values():
+                needed.difference_update(order[-1])
         # Index of the last group that reads a node.
         last = {x: i for i, group in enumerate(order) for n in group for x in (n, *n.predecessors)}
         released: dict[int, list[Node]] = {}
@@ -131,17 +134,21 @@ class Writer:
             stored = {node for node in group if node in live_out or last[node] > i}
             yield group, stored, released.get(i, [])
 
-    def _next_group(self, waiting: Sequence[Node], computed: set[Node]) -> list[Node]:
-        """Return all single nodes that are ready, else one loop over elements, else a loop node."""
+    def _next_group(self, waiting: Mapping[Node, set[Node]]) -> list[Node]:
+        """Return all single nodes that are ready, else one loop over elements, else a loop node.
+
+        Args:
+          waiting: nodes, each with those that must be computed before it.
+        """
         for kind in ("single", "fused", "loop"):
             groups: dict[int, list[Node]] = {}
-            ready = set(computed)
-            for node in waiting:
-                node_kind = "fused" if self.is_fusible(node) else "single"
-                node_kind = "loop" if isinstance(node, LoopNode) else node_kind
-                if node_kind != kind or not ready.issuperset(node.predecessors):
+            ready = set[Node]()
+            for node, needed in waiting.items():
+                is_loop, is_fused = isinstance(node, LoopNode), self.is_fusible(node)
+                node_kind = "loop" if is_loop else "fused" if is_fused else "single"
+                if node_kind != kind or not needed <= ready:
                     continue
-                if kind == "fused" and not node.fusion_barriers <= computed:
+                if is_fused and needed & node.fusion_barriers:
                     continue
                 if kind == "loop":
                     return [node]
