@@ -22,7 +22,7 @@ class Specs(griffe.Extension):
         # Of the source: griffe takes texts in annotations for types.
         (field,) = ast.parse(textwrap.dedent(attr.source)).body
         for call in (x for x in ast.walk(field) if isinstance(x, ast.Call)):
-            if ast.unparse(call.func) in ("Spec", "Quantity"):
+            if ast.unparse(call.func) in ("Spec", "Quantity", "tunable"):
                 attr.docstring = griffe.Docstring(text_of(call), parent=attr)
                 attr.annotation = parts[0]
                 return
@@ -31,8 +31,14 @@ class Specs(griffe.Extension):
 def text_of(call: ast.Call) -> str:
     """Return meaning, unit and limits of a declaration as a sentence."""
     unit, about = [*(x.value for x in call.args if isinstance(x, ast.Constant)), "", ""][:2]
-    limits = {x.arg: ast.unparse(x.value) for x in call.keywords if x.arg in _LIMITS}
+    limits: dict[str, str] = dict(zip(("ge", "le"), map(ast.unparse, call.args[2:4]), strict=False))
+    if ast.unparse(call.func) == "tunable":  # its arguments are the interval of tuners
+        limits = {} if any(x.arg == "gt" for x in call.keywords) else {"ge": "0"}
+    limits |= {x.arg: ast.unparse(x.value) for x in call.keywords if x.arg in _LIMITS}
     text = f"{str(about)[:1].upper()}{str(about)[1:]}".removesuffix(".")
     if unit not in ("", "1") and f"[{unit}]" not in text:
         text += f" [{unit}]"
-    return "; ".join([text, *(f"{_LIMITS[name]} {x}" for name, x in limits.items())]) + "."
+    return (
+        "; ".join([text, *(f"{_LIMITS[name]} {x}" for name, x in limits.items() if x != "None")])
+        + "."
+    )
