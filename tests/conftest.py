@@ -17,9 +17,6 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 FAST_COMPILATION = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "true", "NUMBA_DISABLE_JIT": "1"}
 if metadata.version("jax") < "0.11":
     flags = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-    # Passes that move and unroll loops take a tenth of the compilation.
-    flags += " --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,"
-    flags += "while-loop-constant-sinking,small-while-loop-hoisting"
     FAST_COMPILATION["XLA_FLAGS"] = flags
 if os.name == "posix":
     FAST_COMPILATION["RPS_COMPILER"] = str(Path(__file__).with_name("cc"))

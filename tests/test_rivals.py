@@ -370,12 +370,15 @@ def test_a_twist_is_within_the_speed_limits(name):
     while hasattr(limits, "law"):
         limits = limits.law
     limits = getattr(limits, "pose", limits)
+    v_max, omega_max = (  # a law may move faster on the way to and from the object
+        max(getattr(limits, f"{x}_max"), getattr(limits, f"{x}_free", 0)) for x in ("v", "omega")
+    )
     for x, y, z in default_rng(4).uniform(-1, 1, (16, 3)):
         for touching in (True, False):
             touch = observe((0.36, 0.3 * y), (3 * x, 3 * z), (y, z), 3 * x, touching)
             v_x, v_y, omega = twist_of(name, touch, (z, x))
-            assert math.hypot(v_x, v_y) <= limits.v_max * (1 + 1e-6)
-            assert abs(omega) <= limits.omega_max * (1 + 1e-6)
+            assert math.hypot(v_x, v_y) <= v_max * (1 + 1e-6)
+            assert abs(omega) <= omega_max * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("name", RIVALS)

@@ -23,8 +23,6 @@ from jax.ad_checkpoint import checkpoint_name, checkpoint_policies
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from rps_jax.geometry.arrays import Array
-
 with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
     from mujoco import mjx
     from mujoco.mjx._src import math, solver, types
@@ -103,7 +101,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         minimum = solver.solve(refined, fixed.replace(qacc_warmstart=qacc)).qacc
         minimum = checkpoint_name(minimum, SOLUTION)
 
-    def gradient(x: Array) -> Array:
+    def gradient(x: jax.Array) -> jax.Array:
         at = solver.Context.create(model, data.replace(qacc=x), grad=False)
         return at.Ma - data.qfrc_smooth - at.qfrc_constraint
 
@@ -124,7 +122,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.tree_replace(fields)  # pyright: ignore[reportReturnType]
 
 
-def quat_integrate(q: Array, v: Array, dt: Array) -> Array:
+def quat_integrate(q: jax.Array, v: jax.Array, dt: jax.Array) -> jax.Array:
     """Return the quaternion (4,) after a turn by `v` (3,) [rad/s] as MJX does, with derivatives.
 
     Those of MJX are zero below 1e-8 rad/s, as of a body at rest.
