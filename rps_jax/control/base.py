@@ -3,7 +3,6 @@
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import (
     Annotated,
     Any,
@@ -12,7 +11,6 @@ from typing import (
     NamedTuple,
     Protocol,
     TypeVar,
-    cast,
     runtime_checkable,
 )
 
@@ -22,7 +20,6 @@ from numpy.typing import ArrayLike
 
 from rps_jax.control.observation import Details, Twist
 from rps_jax.geometry.arrays import Array, Parameter, Pytree
-from rps_jax.record import files
 from rps_jax.robot.base import LoadCell
 from rps_jax.robot.robot import DriveKind
 from rps_jax.spec import Bound as Bound
@@ -75,12 +72,6 @@ Obs = TypeVar("Obs")
 def bounds_of(kind: type) -> tuple[tuple[str, Bound], ...]:
     """Return the names of parameters and the intervals of tuners in their declarations."""
     return tuple((name, x.tune) for name, x in specs_of(kind).items() if x.tune is not None)
-
-
-def tuned_presets(params: Params, *names: str) -> dict[str, Params]:
-    """Return presets of a law by name: its parameters, with the changes in `laws/tuned.json`."""
-    tuned = files.read_json(Path(__file__).with_name("laws") / "tuned.json")
-    return {name: cast(Any, params)._replace(**tuned.get(name, {})) for name in names}
 
 
 def nested_bounds(name: str, bounds: Mapping[str, Bound]) -> dict[str, Bound]:

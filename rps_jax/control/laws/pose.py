@@ -69,7 +69,6 @@ from rps_jax.control.base import (
     SpeedMax,
     SuccessDistance,
     bounds_of,
-    tuned_presets,
 )
 from rps_jax.control.box import FLUSH, Box, extents, feel, turned, unknown_box
 from rps_jax.control.laws.unicycle import MODES, contact_of, turn_around
@@ -518,10 +517,35 @@ LAW = Law(
     observe_sent=observe_sent,
     memory=memory,
 )
-# The second and the third are for bases that cannot move sideways: tuned in `wide` with boxes, and
-# the same with a narrow front, as 0.3 m of `turtlebot4`. Their speed without contact is our choice:
-# at the paper's speeds most manoeuvres take longer than 150 s.
-PRESETS = tuned_presets(PoseParams(), "pose", "pose_drive", "pose_narrow")
+_DRIVE = PoseParams(  # tuned in `wide` with boxes and a differential base
+    r=0.2459,
+    s_min=0.9729,
+    s_flush=0.6344,
+    s_back=0.1811,
+    y_tol=0.02185,
+    cap=0.08421,
+    y_miss=0.02424,
+    K_h=1.7,
+    h_max=0.3127,
+    omega_push=0.01651,
+    l_edge=0.2626,
+    l_turn=0.252,
+    back=0.2116,
+    R=0.6854,
+    gap=0.3875,
+    beyond=0.05025,
+    looks=1.0,
+    tau=0.5982,
+    # Our choice: at the paper's speeds most of its manoeuvres take longer than 150 s.
+    v_free=0.2,
+    omega_free=0.5,
+)
+PRESETS = {
+    "pose": PoseParams(),
+    "pose_drive": _DRIVE,  # for bases that cannot move sideways
+    # The same with a narrow front, as 0.3 m of `turtlebot4`.
+    "pose_narrow": _DRIVE._replace(l_edge=0.13, l_turn=0.14, gap=0.15, beyond=0.03),
+}
 
 
 def preset_of(robot: Robot) -> str | None:
@@ -531,4 +555,4 @@ def preset_of(robot: Robot) -> str | None:
     if robot.drive == "omni":
         return "pose"
     # A contact that is off by l_edge must still be on the front.
-    return "pose_drive" if robot.half_width > PRESETS["pose_drive"].l_edge else "pose_narrow"
+    return "pose_drive" if robot.half_width > _DRIVE.l_edge else "pose_narrow"

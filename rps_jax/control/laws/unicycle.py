@@ -50,15 +50,7 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import (
-    ApproachSpeed,
-    Law,
-    Memory,
-    OmegaMax,
-    SuccessDistance,
-    bounds_of,
-    tuned_presets,
-)
+from rps_jax.control.base import ApproachSpeed, Law, Memory, OmegaMax, SuccessDistance, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Number, Parameter
@@ -366,8 +358,57 @@ LAW = Law(
     room=1.0,
     memory=memory,
 )
+_TUNED = UnicycleParams()
 # Names of the presets that are tuned for bases with a drive.
 PRESET_OF: dict[str, str] = {"differential": "unicycle", "car": "unicycle_car"}
-PRESETS = tuned_presets(
-    UnicycleParams(), "unicycle", "unicycle_car", "unicycle_round", "unicycle_front"
-)
+PRESETS = {
+    "unicycle": _TUNED,
+    "unicycle_car": _TUNED._replace(
+        r=0.09525,
+        K_e=1.304,
+        K_l=7.918,
+        l_dead=0.1664,
+        l_edge=0.3328,
+        e_far=3.054,
+        d_near=0.2219,
+        e_near=2.412,
+        K_near=1.121,
+        t_lost=0.2308,
+        back=0.01371,
+        carrot=1.155,
+        R=1.082,
+        R_s=0.988,
+    ),
+    "unicycle_round": _TUNED._replace(
+        r=0.2154,
+        K_e=0.698,
+        K_l=4.354,
+        l_dead=0.1978,
+        l_edge=0.2193,
+        e_far=3.122,
+        d_near=0.4278,
+        e_near=2.09,
+        K_near=2.425,
+        t_lost=2.194,
+        back=0.15,
+        carrot=1.385,
+        R=0.9212,
+        R_s=0.9204,
+    ),
+    "unicycle_front": _TUNED._replace(
+        r=0.2494,
+        K_e=1.542,
+        K_l=4.546,
+        l_dead=0.1136,
+        l_edge=0.2288,
+        d_near=0.6886,
+        e_near=1.758,
+        K_near=1.469,
+        t_lost=1.179,
+        back=0.103,
+        carrot=0.8061,
+        e_far=3.2,
+        R=1.267,
+        R_s=1.267,
+    ),
+}
