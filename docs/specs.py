@@ -31,14 +31,13 @@ class Specs(griffe.Extension):
 def text_of(call: ast.Call) -> str:
     """Return meaning, unit and limits of a declaration as a sentence."""
     unit, about = [*(x.value for x in call.args if isinstance(x, ast.Constant)), "", ""][:2]
-    limits: dict[str, str] = dict(zip(("ge", "le"), map(ast.unparse, call.args[2:4]), strict=False))
-    if ast.unparse(call.func) == "tunable":  # its arguments are the interval of tuners
-        limits = {} if any(x.arg == "gt" for x in call.keywords) else {"ge": "0"}
-    limits |= {x.arg: ast.unparse(x.value) for x in call.keywords if x.arg in _LIMITS}
+    keywords = {x.arg: ast.unparse(x.value) for x in call.keywords if x.arg in _LIMITS}
+    if ast.unparse(call.func) == "tunable":  # its other arguments are the interval of tuners
+        first = {} if "gt" in keywords else {"ge": "0"}
+    else:
+        first = dict(zip(("ge", "le"), map(ast.unparse, call.args[2:4]), strict=False))
+    limits = [f"{_LIMITS[name]} {x}" for name, x in (first | keywords).items() if x != "None"]
     text = f"{str(about)[:1].upper()}{str(about)[1:]}".removesuffix(".")
     if unit not in ("", "1") and f"[{unit}]" not in text:
         text += f" [{unit}]"
-    return (
-        "; ".join([text, *(f"{_LIMITS[name]} {x}" for name, x in limits.items() if x != "None")])
-        + "."
-    )
+    return "; ".join([text, *limits]) + "."

@@ -146,9 +146,8 @@ def task_table(results: xr.Dataset) -> list[list[str]]:
 def nan_table(results: xr.Dataset | xr.DataTree) -> list[list[str]]:
     """Return a row for each law that returned NaN or infinity, of results of trials by any axes."""
     rows = [["law", "trials that it ended", "first at"]]
-    for node in (
-        xr.DataTree(results).subtree if isinstance(results, xr.Dataset) else results.subtree
-    ):
+    tree = xr.DataTree(results) if isinstance(results, xr.Dataset) else results
+    for node in tree.subtree:
         if "nan_twist" not in node or not node.nan_twist.any():
             continue
         laws = node.get("law", xr.DataArray("the law"))

@@ -152,8 +152,9 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
     if is_default and isinstance(command, OutputCommand):
         default, command = command.out, command.in_free_place()
         if command.out != default:
-            kind = "the folder of this one" if isinstance(command, Question) else "this one"
-            print(f"{default} holds another run: {kind} is {command.out}.")
+            is_run = isinstance(command, Question)
+            holds = "holds another run: the folder of this one" if is_run else "exists: this one"
+            print(f"{default} {holds} is {command.out}.")
     _raise_interrupts()
     if note := command.note():
         print(note)
