@@ -43,10 +43,12 @@ from rps_jax.tuning.run import Tuning
 from sweeps.study_base import CollectedStudy, Parts, Table, mean_interval, part_name
 
 FOLDER, DRUMS = "sweeps/gradients", ("random_cylinder",)  # from the root of the repository
-# Options of tunings by the number of tuned parameters: those of RPS, or entries of tables.
+# Options of tunings by the number of tuned parameters: those of RPS, those of RPS+ for one robot
+# and one family of objects, or entries of tables.
 COUNTS: dict[int, dict[str, Any]] = {
     6: {"tuned": ("K_h", "K_v", "L", "beta", "l_cr", "d_th")},
     13: {"tuned": ("full",)},
+    18: {"law": "rps_plus", "domain": ("hostile",), "robot": "kairos", "objects": ("random_box",)},
     **{n: {"law": f"{FOLDER}/tables.py:Table{n}", "objects": DRUMS} for n in (64, 512, 2048, 4097)},
 }
 SCORES = "success", "score"  # of a trial in a test world
@@ -167,15 +169,15 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     methods: tuple[str, ...] = (FIRST, "slopes", "evolution")
     """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials), or evolution."""
     counts: tuple[int, ...] = tuple(COUNTS)
-    """Numbers of tuned parameters: 6 and 13 of RPS, or 64, 512, 2048 and 4097 of laws with
-    tables."""
+    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ for one robot, or 64, 512, 2048 and
+    4097 of laws with tables."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
     simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
     """Budgets of simulated time [s]; a differentiated second counts as four. After the largest no
     generation starts."""
     worlds: int = option(400, 1, 1_000_000)
-    """Number of test worlds of `wide`."""
+    """Number of test worlds."""
     setting: Setting = field(default=Setting(rules=Rules(horizon=150.0)), kw_only=True)
     out: Path | str | None = field(default="runs/race", kw_only=True)
     """Run folder; the tunings have folders there."""
@@ -223,6 +225,7 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
         _, firsts, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
         chosen = [law_of(best[at], start) for at in firsts]
         options = {"split": "test", "setting": self.setting, "progress": False}
+        options |= {"robot": COUNTS[count].get("robot")}
         scores = evaluate([start, *chosen], domain, self.worlds, **options)
         coords = {"seed": self.seeds, "method": self.methods, "budget": self.simulated}
         dims, shape = (*coords,), (*map(len, coords.values()),)
@@ -238,8 +241,8 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     def intro(self, results: xr.Dataset) -> str:
         """Return the budgets."""
         return (
-            f"Tunings from the paper's parameters, with budgets of simulated time; success in "
-            f"{self.worlds:,} worlds that no tuning has met."
+            "Tunings from the paper's parameters, or those of RPS+ (18), with budgets of simulated "
+            f"time; success in {self.worlds:,} worlds that no tuning has met."
         )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
@@ -293,7 +296,8 @@ def best_within(curve: pd.DataFrame, budget: float) -> pd.Series:
 def problem(count: int) -> tuple[Any, str]:
     """Return the law at the start and the domain of the test worlds of a problem."""
     _, start = resolve_law(COUNTS[count].get("law", "rps"))
-    return start, ",".join(["wide", *(f"objects={x}" for x in COUNTS[count].get("objects", ()))])
+    names = [f"objects={x}" for x in COUNTS[count].get("objects", ())]
+    return start, ",".join([*COUNTS[count].get("domain", ("wide",)), *names])
 
 
 def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:

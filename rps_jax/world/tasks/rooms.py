@@ -40,6 +40,7 @@ from rps_jax.world.tasks.path import APPROACH, LOOKAHEAD, Following, PathCourse
 _ROS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 _IGNORED = ("map_type", "frame_id")
 _UNKNOWN = 205  # grey of unknown cells, as maps are saved
+_MAP = "give polygons, an outline or a map.yaml in a file, as --task map.yaml,goal=4:2"
 _OUTSIDE = "it lies in an obstacle or outside of the room (of an image, try a smaller tolerance)"
 _MAX_WALLS = 4096
 _NEAR = 128  # walls of a world: those nearest to its path, if the map has more
@@ -156,7 +157,7 @@ class Rooms(Following):
         count = len(self.walls) / 2
         _check_count(count)
         for is_bad, name, value, rule in (
-            (not count or count % 1, "walls", count, "give polygons, an outline or a map.yaml"),
+            (not count or count % 1, "walls", count or "()", _MAP),
             (not len(self.start), "start", "()", "give x, y and yaw in the map, as [1, 2, 0]"),
             (not len(self.goal), "goal", "()", "give x and y in the map, as [4, 2]"),
         ):
