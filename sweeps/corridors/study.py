@@ -423,10 +423,11 @@ def figure_of(results: xr.Dataset, curves: Mapping[tuple[str, str], Curve]) -> F
         for i, law in enumerate(map(str, results.law.values)):
             successes = (started.success.sel(row=row, law=law).values > 0) @ one_hot
             trials, colour = one_hot.sum(axis=0), f"C{i}"
+            line = "-" if i < 7 else "--"  # there are seven colours
             success_rates(
                 ax, middle, successes, trials, curve=i, color=colour, ls="none", label=law
             )
-            ax.plot(fine, 100 * curves[row, law].rates(fine), color=colour, lw=1)
+            ax.plot(fine, 100 * curves[row, law].rates(fine), color=colour, ls=line, lw=1)
         ax.set_title(row, fontsize=9, loc="left")
         ax.grid(alpha=0.3)
     for ax in axes[-1]:
