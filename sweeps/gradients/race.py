@@ -185,6 +185,8 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     def check(self) -> None:
         super().check()
         errors.check_each_once("simulated", self.simulated)
+        for label in itertools.product(self.seeds[:1], self.counts, self.methods):
+            self.tuning(*label).validate()
 
     def parts(self, run: Run) -> Parts:
         """Return the function that runs and tests the tunings of each count."""
