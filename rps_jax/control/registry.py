@@ -147,9 +147,11 @@ def check_drive(params: LawParams, drive: DriveKind) -> None:
 
 
 def _name_of(params: LawParams) -> str:
-    """Return the name of the first law of a class of parameters."""
-    kind = type(params)
-    return next((name for name, x in LAWS.items() if type(x) is kind), kind.__name__)
+    """Return the name of a law with these parameters, or of the first with parameters like them."""
+    leaves, kind = jax.tree.leaves(params), type(params)
+    names = {name: jax.tree.leaves(x) for name, x in LAWS.items() if type(x) is kind}
+    same = (name for name, x in names.items() if all(map(np.array_equal, x, leaves)))
+    return next(same, next(iter(names), kind.__name__))
 
 
 def check_params(params: Params) -> Params:
