@@ -390,6 +390,7 @@ RECIPES: dict[str, Recipe] = {
     "gradients_stiff": recipe(f"rps sweeps/gradients/stiff.py {_MACHINE}", cores=3),
     "gradients_direction": recipe(f"rps sweeps/gradients/direction.py {_MACHINE}", cores=5),
     "gradients_race": recipe(f"rps sweeps/gradients/race.py {_MACHINE}", cores=60),
+    "gradients_race_18": recipe(f"rps sweeps/gradients/race.py --counts 18 {_MACHINE}", cores=20),
     "gradients_tables": recipe(
         *_filled(f"{_TABLES}:{{0}} --domain hostile {_HOSTILE} --out runs/{{0}}", *_PLUS_TABLES),
         "rps ladder --domain wide hostile --worlds 10000 --seed 69 --laws rps_plus "
