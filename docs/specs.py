@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import ast
-import textwrap
-from typing import Any
+import math
+import pydoc
+from typing import Any, cast
 
 import griffe
+
+from rps_jax.spec import Spec, specs_of
 
 _LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
@@ -17,27 +19,20 @@ class Specs(griffe.Extension):
     def on_attribute_instance(self, *, attr: griffe.Attribute, **kwargs: Any) -> None:
         """Set docstring and annotation of an attribute that has a declaration."""
         parts = getattr(getattr(attr.annotation, "slice", None), "elements", None)
-        if parts is None or not str(attr.annotation).startswith("Annotated["):
+        owner, is_declared = attr.parent, str(attr.annotation).startswith("Annotated[")
+        if parts is None or not is_declared or owner is None or not owner.is_class:
             return
-        # Of the source: griffe takes texts in annotations for types.
-        (field,) = ast.parse(textwrap.dedent(attr.source)).body
-        for call in (x for x in ast.walk(field) if isinstance(x, ast.Call)):
-            if ast.unparse(call.func) in ("Spec", "Quantity", "tunable"):
-                attr.docstring = griffe.Docstring(text_of(call), parent=attr)
-                attr.annotation = parts[0]
-                return
+        spec = specs_of(cast("type", pydoc.locate(owner.path))).get(attr.name)
+        if spec and spec.about:
+            attr.docstring = griffe.Docstring(text_of(spec), parent=attr)
+            attr.annotation = parts[0]
 
 
-def text_of(call: ast.Call) -> str:
+def text_of(spec: Spec) -> str:
     """Return meaning, unit and limits of a declaration as a sentence."""
-    unit, about = [*(x.value for x in call.args if isinstance(x, ast.Constant)), "", ""][:2]
-    keywords = {x.arg: ast.unparse(x.value) for x in call.keywords if x.arg in _LIMITS}
-    if ast.unparse(call.func) == "tunable":  # its other arguments are the interval of tuners
-        first = {} if "gt" in keywords else {"ge": "0"}
-    else:
-        first = dict(zip(("ge", "le"), map(ast.unparse, call.args[2:4]), strict=False))
-    limits = [f"{_LIMITS[name]} {x}" for name, x in (first | keywords).items() if x != "None"]
-    text = f"{str(about)[:1].upper()}{str(about)[1:]}".removesuffix(".")
-    if unit not in ("", "1") and f"[{unit}]" not in text:
-        text += f" [{unit}]"
-    return "; ".join([text, *limits]) + "."
+    limits = [(words, getattr(spec, name)) for name, words in _LIMITS.items()]
+    finite = [f"{words} {x:g}" for words, x in limits if x is not None and abs(x) < math.inf]
+    text = f"{spec.about[:1].upper()}{spec.about[1:]}".removesuffix(".")
+    if spec.unit not in ("", "1") and f"[{spec.unit}]" not in text:
+        text += f" [{spec.unit}]"
+    return "; ".join([text, *finite]) + "."
