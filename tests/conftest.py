@@ -91,8 +91,13 @@ def pytest_collection_modifyitems(items):
 def pytest_collection_finish(session):
     # Python's collector takes a tenth of the time of the tests: it searches modules and programs,
     # which stay, for each few hundred objects that are created.
+    gc.set_threshold(50_000, 20, 20)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def frozen_programs():
+    """Hide the programs of earlier files from the collector."""
     gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -137,7 +137,7 @@ LAW = ROOT / "notebooks" / "examples" / "custom_law.py"
 
 
 def test_a_custom_law_is_scored_in_the_worlds_of_the_ladder(tmp_path, capsys, registries):
-    options = f"--domain wide,objects=random_cylinder --worlds 6 {QUASISTATIC} --horizon 40 --out"
+    options = f"--domain wide,objects=random_cylinder --worlds 6 {QUASISTATIC} --horizon 20 --out"
     assert rps(f"score {LAW},v=0.04 {options}", tmp_path / "score") == 0
     text, results = capsys.readouterr().out, load(tmp_path / "score")
     assert results.law.values.tolist() == ["p_control,v=0.04", "rps", "rps_plus"]

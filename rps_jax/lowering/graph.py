@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeAlias
@@ -97,7 +98,7 @@ class Target:
 
 def size_of(shape: Sequence[int]) -> int:
     """Return the number of elements of a shape."""
-    return int(np.prod(shape, dtype=int))
+    return math.prod(shape)
 
 
 def positions(shape: Sequence[int]) -> np.ndarray:
@@ -365,7 +366,8 @@ def flat(value: Value, size: int) -> Value:
         step = value.step if size_of(value.shape) == size else 0
         return value._replace(shape=(size,), step=step)
     array = np.ascontiguousarray(value).reshape(-1)
-    return array[:1] if len({x.tobytes() for x in array}) == 1 else array
+    is_uniform = array.size > 1 and len({x.tobytes() for x in array}) == 1
+    return array[:1] if is_uniform else array
 
 
 def live_nodes(roots: Iterable[Node]) -> list[Node]:
