@@ -172,14 +172,10 @@ def extensions(tmp_path_factory):
     return folder
 
 
-def process(folder, *words):
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return output_of(sys.executable, *words, cwd=folder, env=environment)
-
-
 def test_examples_of_extensions_work_from_python(extensions):
     """A law, an engine, a quantity and a task are used together, in sweeps and in points."""
-    text = process(extensions, "-c", EVERYWHERE)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    text = output_of(sys.executable, "-c", EVERYWHERE, cwd=extensions, env=environment)
     assert text.startswith(str(PACKAGE))
     assert "domain threshold (low) = 0.01 is not allowed: it must be a number and at least" in text
     assert "did you mean 'threshold'?" in text

@@ -56,11 +56,11 @@ def browser(tmp_path_factory):
 
 
 @contextlib.contextmanager
-def python_push(law, x=-1.0, **options):
-    """The paper's push to (x, 0), or in a task, in double precision."""
+def python_push(law, **options):
+    """The paper's push to (-1, 0) m, or in a task, in double precision."""
     with jax.enable_x64(True):
         setting = Setting("quasistatic")
-        case = Case("box", "S1", (x, 0.0), law, **options)
+        case = Case("box", "S1", (-1.0, 0.0), law, **options)
         live = Live(pushes.build([case], setting), setting)
         live.step(20_000)
         assert live.done

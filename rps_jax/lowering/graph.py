@@ -366,8 +366,7 @@ def flat(value: Value, size: int) -> Value:
         step = value.step if size_of(value.shape) == size else 0
         return value._replace(shape=(size,), step=step)
     array = np.ascontiguousarray(value).reshape(-1)
-    is_uniform = array.size > 1 and len({x.tobytes() for x in array}) == 1
-    return array[:1] if is_uniform else array
+    return array[:1] if len({x.tobytes() for x in array}) == 1 else array
 
 
 def live_nodes(roots: Iterable[Node]) -> list[Node]:
