@@ -166,7 +166,7 @@ def swept(folder: Path, plan: Plan = PLAN, **options: Any) -> Path:
     return folder
 
 
-def still(worlds: WorldBatch, *_) -> Callable[..., list[Trial]]:
+def still(worlds: WorldBatch, *_):
     """Return a stepper of a live trial that stays at its start, without the program of a step."""
     start = jax.jit(partial(trial.start_all, law=worlds.law))
     return lambda inputs, *_: [start(*inputs, np.ones(1, bool))]
