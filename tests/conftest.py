@@ -8,7 +8,6 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-import shapes
 import tolerances
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -56,8 +55,10 @@ def pytest_configure(config):
         RATIOS.append(tolerances.install(Path(f"{path}.{worker}")))
     # A shell that starts pytest in the background lets it and its subprocesses ignore interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    import shapes  # and with it JAX, which reads the environment once
+
     shapes.install()
-    import graph_verifier  # and with it JAX, which reads the environment once
+    import graph_verifier
     import jax
 
     from rps_jax.engines import device
@@ -74,12 +75,12 @@ def pytest_configure(config):
 
 # Slow files start first; a slow file at the end would leave processors idle.
 LONGEST = """
-    library derivatives drives replay rivals native drive_commands push_page learning export
-    lowering bags finger contact_derivatives fit faults smooth pose mjx_gradients support trial
-    sweep examples view robot tasks cli transformations evaluate task_commands tune random_laws
-    house rooms ladder failures publish gym law ros2 benchmark gallery video frames gpu_writer
-    figures film fused scene package_laws env floors shell planning walls verifier footprint
-    predict_push skin ground
+    derivatives push_page pose view library drives learning replay cli drive_commands package_laws
+    finger tune sweep transformations house export mjx_gradients lowering support native robot rooms
+    bags gpu_writer contact_derivatives video rivals random_laws evaluate tasks law_files
+    task_commands failures examples trial ros2 floors faults points fit shell physics film smooth
+    benchmark law figures ladder gym gradients walls planning programs env gallery descent ground
+    limits footprint scene force cluster fused feet frames pages study
 """
 
 
@@ -91,8 +92,14 @@ def pytest_collection_modifyitems(items):
 def pytest_collection_finish(session):
     # Python's collector takes a tenth of the time of the tests: it searches modules and programs,
     # which stay, for each few hundred objects that are created.
+    gc.set_threshold(50_000, 20, 20)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def frozen_programs():
+    """Hide the programs of earlier files from the collector."""
+    gc.collect()  # frozen garbage would stay
     gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -37,6 +37,7 @@ from rps_jax.trials import trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules, Trial
+from rps_jax.trials.worlds import WorldBatch
 from rps_jax.world import domain, objects, quantity, tasks
 from rps_jax.world.domain import Range, parse_domain
 from rps_jax.world.physics import preset
@@ -163,6 +164,12 @@ def swept(folder: Path, plan: Plan = PLAN, **options: Any) -> Path:
     open_run(folder, plan)
     execution.run_missing(folder, plan, slots=SLOTS, **options)
     return folder
+
+
+def still(worlds: WorldBatch, *_):
+    """Return a stepper of a live trial that stays at its start, without the program of a step."""
+    start = jax.jit(partial(trial.start_all, law=worlds.law))
+    return lambda inputs, *_: [start(*inputs, np.ones(1, bool))]
 
 
 def results_of(laws: Sequence[str] = ("law",), **columns: Any) -> xr.Dataset:

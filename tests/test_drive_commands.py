@@ -102,7 +102,7 @@ def test_pushes_and_exports_without_a_law_have_one_for_the_base(drive, law, tmp_
 
 def test_the_ladder_and_the_score_use_the_laws_that_the_base_can_follow():
     robot = ROBOTS["differential"]
-    options = {"domain": DRUMS, "worlds": 2, "setting": BRIEF, "slots": SLOTS}
+    options = {"domain": DRUMS, "worlds": 8, "setting": BRIEF, "slots": SLOTS}
     scored = rps_jax.score("unicycle,r=0.2", robot=robot, **options)
     assert scored.law.values.tolist() == ["unicycle,r=0.2", "unicycle"]
     known = registry.laws_for("differential")

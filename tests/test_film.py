@@ -6,7 +6,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from helpers import decode, refusal, refusing, rps, setting_of
+from helpers import decode, refusal, refusing, rps, setting_of, slow
 
 from rps_jax.app import film
 from rps_jax.app.cli import flags
@@ -166,7 +166,7 @@ def test_a_finished_trial_is_labelled_and_not_drawn_again(tmp_path):
     assert last[1] is not previous[1]
 
 
-@pytest.mark.parametrize("law", ["unicycle", "pose"])
+@pytest.mark.parametrize("law", ["unicycle", slow("pose")])
 def test_a_film_shows_mode_and_memory_of_the_law(law, tmp_path):
     domain = dataclasses.replace(DOMAINS["paper"], objects=("box",), targets=((-2.0, 0.1),))
     domain = dataclasses.replace(domain, robot=Robot(drive="differential"))

@@ -10,7 +10,7 @@ from importlib import import_module
 
 import jax
 import pytest
-from helpers import ROOT, addresses, inner_names, output_of
+from helpers import ROOT, addresses, inner_names, output_of, printed, rps
 
 import rps_jax
 
@@ -172,33 +172,27 @@ def extensions(tmp_path_factory):
     return folder
 
 
-def process(folder, *words):
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return output_of(sys.executable, *words, cwd=folder, env=environment)
-
-
 def test_examples_of_extensions_work_from_python(extensions):
     """A law, an engine, a quantity and a task are used together, in sweeps and in points."""
-    printed = process(extensions, "-c", EVERYWHERE)
-    assert printed.startswith(str(PACKAGE))
-    assert (
-        "domain threshold (low) = 0.01 is not allowed: it must be a number and at least" in printed
-    )
-    assert "did you mean 'threshold'?" in printed
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    text = output_of(sys.executable, "-c", EVERYWHERE, cwd=extensions, env=environment)
+    assert text.startswith(str(PACKAGE))
+    assert "domain threshold (low) = 0.01 is not allowed: it must be a number and at least" in text
+    assert "did you mean 'threshold'?" in text
 
 
-def test_examples_of_extensions_work_on_the_command_line(extensions):
+def test_examples_of_extensions_work_on_the_command_line(
+    extensions, registries, monkeypatch, capsys
+):
     """Files before the command register what its options name, and its help lists them."""
-    files = "my_engine.py", "my_quantity.py", "band.py"
-    shell = "-m", "rps_jax", *files, "sweep"
-    helped = process(extensions, *shell, "--help")
+    monkeypatch.chdir(extensions)
+    shell = "my_engine.py my_quantity.py band.py sweep"
+    helped = printed(capsys, f"{shell} --help")
     assert "quasistatic,dummy}" in re.sub(r"\s", "", helped)
     options = "--worlds 8 --horizon 0.3 --engine dummy --task band --out run"
-    domain = "wide,objects=random_cylinder,threshold=0.1:0.5"
-    laws = "my_law.py:AheadParams,gain=0.2"
-    process(extensions, *shell, "--laws", laws, "--domain", domain, *options.split())
+    options += " --domain wide,objects=random_cylinder,threshold=0.1:0.5"
+    assert rps(f"{shell} --laws my_law.py:AheadParams,gain=0.2 {options}") == 0
     results = rps_jax.load(extensions / "run")
     assert {"off_line", "threshold"} <= {*map(str, results.variables)}
-    studied = "my_study.py", "--law", "rps", "--worlds", "2", "--horizon", "0.3", "--engine"
-    printed = process(extensions, "-m", "rps_jax", *studied, "quasistatic")
-    assert "of 2 succeeded" in printed
+    study = "my_study.py --law rps --worlds 2 --horizon 0.3 --engine quasistatic"
+    assert "of 2 succeeded" in printed(capsys, study)

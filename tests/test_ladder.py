@@ -90,14 +90,14 @@ def test_a_law_may_have_the_values_of_a_file(tmp_path):
 def test_all_laws_meet_the_same_test_worlds():
     laws = ("rps_tuned", "pursuit", "dipole")
     options = {"setting": setting_of(20.0), "slots": 8}
-    results = climb(laws, CYLINDERS, 6, **options)
+    results = climb(laws, CYLINDERS, 8, **options)
     assert results.success.dims == ("law", "world")
     assert results.law.values.tolist() == list(laws)
     assert results.senses.values.tolist() == ["touch", "touch", "pose"]
     assert results.mass.dims == ("world",)
-    drawn = draws.table(draws.draw(CYLINDERS, seed_of(0, "test"), np.arange(6)))
+    drawn = draws.table(draws.draw(CYLINDERS, seed_of(0, "test"), np.arange(8)))
     assert_allclose(results.mass, drawn["mass"][0], rtol=1e-6)
-    renamed = climb({"mine": RPSParams.tuned()}, CYLINDERS, 6, **options)
+    renamed = climb({"mine": RPSParams.tuned()}, CYLINDERS, 8, **options)
     assert_array_equal(renamed.time.sel(law="mine"), results.time.sel(law="rps_tuned"))
     assert_array_equal(renamed.mass, results.mass)
 
@@ -105,13 +105,13 @@ def test_all_laws_meet_the_same_test_worlds():
 def test_several_domains_are_several_ladders(tmp_path, capsys):
     setting = setting_of(2.0)
     domains = ("wide,objects=random_cylinder", "wide,objects=random_cylinder,gap=0.01")
-    tree = climb(("rps", "dipole"), domains, 6, setting=setting, slots=8, out=tmp_path)
+    tree = climb(("rps", "dipole"), domains, 8, setting=setting, slots=8, out=tmp_path)
     assert list(tree.children) == list(domains)
     for domain in domains:
-        alone = climb(("rps", "dipole"), domain, 6, setting=setting, slots=8)
+        alone = climb(("rps", "dipole"), domain, 8, setting=setting, slots=8)
         xr.testing.assert_identical(tree[domain].to_dataset(), alone)
         assert_array_equal(load(tmp_path / domain).success, alone.success)
-    command = f"ladder --laws rps dipole --worlds 6 {QUASISTATIC} --horizon 2 --out {tmp_path}"
+    command = f"ladder --laws rps dipole --worlds 8 {QUASISTATIC} --horizon 2 --out {tmp_path}"
     assert rps(command, "--domain", *domains) == 0  # reads the finished sweeps
     text = capsys.readouterr().out
     for domain in domains:
@@ -123,28 +123,28 @@ def test_several_domains_are_several_ladders(tmp_path, capsys):
 
 
 def test_the_command_reports_information_against_success(tmp_path, capsys):
-    command = f"ladder --domain wide,objects=random_cylinder --worlds 6 {QUASISTATIC}"
+    command = f"ladder --domain wide,objects=random_cylinder --worlds 8 {QUASISTATIC}"
     command += " --laws rps_tuned pursuit --out"
     text = printed(capsys, command, tmp_path)
     assert "## Models" not in text
     for heading in ("Information against success", "Against rps_tuned, world by world"):
         assert f"## {heading}" in text
     assert (tmp_path / "ladder.png").stat().st_size > 10_000
-    assert load(tmp_path).success.sizes == {"law": 2, "world": 6}
+    assert load(tmp_path).success.sizes == {"law": 2, "world": 8}
 
 
 LAW = ROOT / "notebooks" / "examples" / "custom_law.py"
 
 
 def test_a_custom_law_is_scored_in_the_worlds_of_the_ladder(tmp_path, capsys, registries):
-    options = f"--domain wide,objects=random_cylinder --worlds 6 {QUASISTATIC} --horizon 40 --out"
+    options = f"--domain wide,objects=random_cylinder --worlds 8 {QUASISTATIC} --horizon 20 --out"
     assert rps(f"score {LAW},v=0.04 {options}", tmp_path / "score") == 0
     text, results = capsys.readouterr().out, load(tmp_path / "score")
     assert results.law.values.tolist() == ["p_control,v=0.04", "rps", "rps_plus"]
     success = results.success.values > 0
-    rates = [tables.share(int(n), 6) for n in success.sum(axis=1)]
+    rates = [tables.share(int(n), 8) for n in success.sum(axis=1)]
     median = f"{np.median(results.time.values[0][success[0]]):.1f} s" if success[0].any() else "-"
-    worlds = "6 test worlds of wide,objects=random_cylinder, seed 0, quasistatic"
+    worlds = "8 test worlds of wide,objects=random_cylinder, seed 0, quasistatic"
     cells = ["p_control,v=0.04", rates[0], median, *rates[1:], worlds]
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
     at = rows.index(cells)

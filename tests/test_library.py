@@ -20,6 +20,7 @@ from numpy.testing import assert_array_equal
 
 import rps_jax
 from rps_jax.analysis import figures
+from rps_jax.engines.base import Engine
 from rps_jax.geometry.footprint import polygon
 from rps_jax.record import files
 from rps_jax.runs.sweep import merge
@@ -64,7 +65,7 @@ def run(tmp_path_factory):
 
 FAST = {"setting": rps_jax.Setting("quasistatic", rules=RULES)}
 SHARED = FAST | {"slots": SLOTS}  # with one program for all
-TUNED = {"objects": ("random_cylinder",), "tuned": ("K_h", "K_v"), "worlds": 2, "validation": 2}
+TUNED = {"objects": ("random_cylinder",), "tuned": ("K_h", "K_v"), "worlds": 2, "validation": 4}
 STORED = {  # from the run folder of a sweep and a new folder, the answer of a call
     "sweep": lambda run, out: rps_jax.sweep("rps", DRUMS, worlds=8, out=out, **SHARED),
     "score": lambda run, out: rps_jax.score("nps", domain=DRUMS, worlds=4, out=out, **SHARED),
@@ -181,6 +182,7 @@ def mark_long(name):
 @pytest.mark.parametrize("name", [mark_long(name) for name in PUBLIC if examples(name)])
 def test_the_examples_of_docstrings_run(name, tmp_path, monkeypatch, registries):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Engine, "slots", lambda *_: SLOTS)  # for the programs of other tests
     lines = []
     runner = doctest.DocTestRunner(optionflags=OPTIONS)
     for example in examples(name):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import jitted, refusing, rps
+from helpers import jitted, refusing, rps, still
 from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
@@ -491,7 +491,8 @@ def test_the_law_asks_for_the_heading_where_the_goal_has_none():
     assert registry.law_of(registry.LAWS["pose"]).heading
 
 
-def test_a_heading_relative_to_a_face_has_no_arrow_in_the_world_and_no_environment():
+def test_a_heading_relative_to_a_face_has_no_arrow_in_the_world_and_no_environment(monkeypatch):
+    monkeypatch.setattr("rps_jax.trials.live.stepper", still)
     setting = Setting("fused")
     live = Live(pushes.build([Case(task="pose,turn=1.5")], setting), setting)
     live.set_target((1.0, 0.5), 0.3)

@@ -401,21 +401,10 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
     tuned, drums, run = (tmp_path / name for name in ("tuned.json", "drums.json", "run"))
     tuned.write_text(json.dumps({"L": 0.3, "saturate_first": 0}))
     drums.write_text(json.dumps({"objects": ["random_cylinder"], "distance": [1, 2]}))
-    words = "--fidelity fast --worlds 12 --horizon 6 --part 5 --slots"
-    command = [
-        "sweep",
-        *words.split(),
-        SLOTS,
-        "--domain",
-        drums,
-        "--out",
-        run,
-        "--laws",
-        "rps",
-        f"rps,{tuned}",
-    ]
+    command = f"sweep --fidelity fast --worlds 12 --horizon 6 --part 5 --slots {SLOTS}"
+    command += f" --domain {drums} --out {run} --laws rps rps,{tuned}"
     gc.disable()  # as a process starts
-    assert [rps(*command, "--shard", f"{k}/2") for k in (1, 2)] == [0, 0]
+    assert [rps(command, "--shard", f"{k}/2") for k in (1, 2)] == [0, 0]
     assert gc.isenabled()
     gc.unfreeze()
     text = printed(capsys, "merge", run, "--out", run)

@@ -22,6 +22,7 @@ from helpers import (
     refusal,
     refusing,
     setting_of,
+    still,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
@@ -244,6 +245,7 @@ def test_the_page_plays_a_push(page, browser):
     "task", ["reach", "pose", "pose,turn=1", "path", "path,heading=1", "corridor"]
 )
 def test_a_target_has_handles_where_it_can_be_moved(page, task, monkeypatch):
+    monkeypatch.setattr("rps_jax.trials.live.stepper", still)
     push = viewer.View("box", task=task, setting=SETTING).push()
     monkeypatch.setattr(push.live, "step", lambda count=1: None)
     page._show_built(lambda: push)

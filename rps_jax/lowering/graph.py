@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeAlias
@@ -97,7 +98,7 @@ class Target:
 
 def size_of(shape: Sequence[int]) -> int:
     """Return the number of elements of a shape."""
-    return int(np.prod(shape, dtype=int))
+    return math.prod(shape)
 
 
 def positions(shape: Sequence[int]) -> np.ndarray:

@@ -75,7 +75,9 @@ class Live:
     @property
     def outcome(self) -> Outcome:
         """Outcome so far, without a batch axis."""
-        return rows(jax.device_get(trial.outcome(self._trial, self._worlds, self._loop)), 0)
+        return rows(
+            jax.device_get(trial.compiled_outcome(self._trial, self._worlds, self._loop)), 0
+        )
 
     @property
     def p_world_target(self) -> np.ndarray:
