@@ -42,9 +42,9 @@ from rps_jax.robot.base import normal
 from rps_jax.robot.shell import HALF_WIDTH, Shell, side_lengths
 from rps_jax.spec import Named, Spec
 
-# [1] of an even contact: the least and the greatest signal over the mean, and the least mean.
-_EVEN, _PROUD, _PRESSED = 0.6, 1.35, 2.0
-_COVERED = 0.5  # [1] signal over that of the neighbour, of a taxel that the object covers
+# [1] of an even contact: the least and the greatest local mean over the mean; the least mean.
+_EVEN, _PROUD, _PRESSED = 0.6, 1.35, 4.0
+_COVERED = 0.35  # [1] signal over that of the neighbour, of a taxel that the object covers
 _NEVER = -1e9  # excess of a dead taxel over the threshold, in temperatures
 
 NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
@@ -277,11 +277,12 @@ def ends_of(
 ) -> Ends:
     """Return the ends of the contact on the front, from the signals [1] of the taxels.
 
-    A contact is even if no inner taxel is much below the mean of the inner ones, which are pressed.
-    The object covers a share of the outermost taxels: their signals over those of their inner
-    neighbours. An end is seen if the contact is even, and the next taxel works and feels nothing,
-    or the outermost one is not covered. Offsets are those of `Observation.l`. The simulated foam
-    senses an object up to 8 mm ahead, without force; a real one needs force, and blurs the ends.
+    A contact is even if the inner taxels are pressed, and no mean of three neighbours is much below
+    that of all: the gains of single taxels differ. The object covers a share of the outermost
+    taxels: their signals over those of their inner neighbours. An end is seen if the contact is
+    even, and the next taxel works and feels nothing, or the outermost one is not covered. Offsets
+    are those of `Observation.l`. The simulated foam senses an object up to 8 mm ahead, without
+    force; a real one needs force, and blurs the ends.
     """
     rows, length = shell.rows(), sum(side_lengths(*shell.sizes).values())
     front = jnp.asarray(shell.half[0], signal.dtype)
@@ -299,20 +300,19 @@ def ends_of(
     signal, alive = signal[first : first + count], alive[first : first + count]
     active = (signal > threshold) & alive
     border, empty = jnp.ones(1, bool), jnp.zeros(1, signal.dtype)
-    hidden = jnp.concatenate([border, ~alive[:-1]]), jnp.concatenate([~alive[1:], border])
-    beside = jnp.concatenate([signal[1:], empty]), jnp.concatenate([empty, signal[:-1]])
+    hidden, beside = _beside(~alive, border), _beside(signal, empty)
     columns = [*jnp.concatenate(parts).T, signal, *hidden, *beside]
     table = jnp.stack([x.astype(signal.dtype) for x in columns], axis=-1)
     left, right = _extremes(active, table)
     inner = active & (table[:, 0] < left[0]) & (table[:, 0] > right[0])
-    total = jnp.sum(inner)
-    outer = jnp.maximum(left[2], right[2])
-    mean = jnp.sum(jnp.where(inner, signal, 0.0)) / jnp.maximum(total, 1)
-    top = jnp.maximum(jnp.where(total > 0, mean, outer), threshold)
-    least = jnp.min(jnp.where(inner, signal, jnp.inf))
-    is_even = (least > _EVEN * top) & (outer < _PROUD * top) & (top > _PRESSED) & (total > 0)
+    pressure, weight = jnp.where(inner, signal, 0.0), inner.astype(signal.dtype)
+    top = jnp.maximum(jnp.sum(pressure) / jnp.maximum(jnp.sum(weight), 1), threshold)
+    sums, weights = (x + sum(_beside(x, empty)) for x in (pressure, weight))
+    least = jnp.min(jnp.where(inner, sums / jnp.maximum(weights, 1), jnp.inf))
+    outer = jnp.maximum(left[2] + left[6], right[2] + right[5]) / 2
+    is_even = (least > _EVEN * top) & (outer < _PROUD * top) & (top > _PRESSED)
     # Over the inner neighbour, so that a slight tilt is no end; this may be dead.
-    inside = jnp.stack([left[5], right[6]])
+    inside = jnp.stack([left[6], right[5]])
     inside = jnp.where(inside > threshold, jnp.minimum(inside, top), top)
     share = jnp.clip(jnp.stack([left[2], right[2]]) / inside, 0.0, 1.0)
     touches = jnp.any(active)
@@ -320,6 +320,11 @@ def ends_of(
     ends = jnp.where(touches, jnp.stack([left[0], right[0]]) + half, 0.0)
     seen = (jnp.stack([left[3], right[4]]) < 0.5) | (share < _COVERED)
     return Ends(ends, seen & is_even, is_even, front)
+
+
+def _beside(values: Array, border: Array) -> Pair:
+    """Return the values (n,) of the previous and of the next taxel, with that beyond the border."""
+    return jnp.concatenate([border, values[:-1]]), jnp.concatenate([values[1:], border])
 
 
 def check_taxels(signal: np.ndarray, shell: Shell, source: str) -> None:

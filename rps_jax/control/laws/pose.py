@@ -16,9 +16,10 @@ offsets e_left and e_right of the ends of an even contact:
       unknown side reaches as far as any contact; the first touch of another face keeps the middle
       of its axis, if that was felt
 
-A contact that is uneven for a second forgets all sides: then the box is a square of half width r
-behind the contact. Let g = h_2 be the way that is left, and m the middle of the box, left of the
-goal's line by y.
+After a second of uneven contact no side is known. If it is narrow, another face may be there: then
+the box is a square of half width r behind the contact. A wide one is only tilted a little, and the
+supports stay. Where no side is known, a push that the side of the base feels puts the square beside
+it. Let g = h_2 be the way that is left, and m the middle of the box, left of the goal's line by y.
 
   Q4  leg: k = 2 if g < s_min, or s_flush where a side is known;  else k = 1 or 3 towards y = 0 if
       |y| > y_tol + cap g + reach kappa (g - s_line)^2 / 4;  else k = 0
@@ -80,7 +81,8 @@ from rps_jax.spec import Spec, document, tunable
 
 PUSH, BACK, AROUND = 0, 1, 2  # modes
 _QUARTER = np.pi / 2  # [rad]
-_UNEVEN = -1.0  # [s] of uneven contact, after which all sides are forgotten
+_UNEVEN = -1.0  # [s] of uneven contact, after which no side is known
+_NARROW = 0.25  # [m] up to which an uneven contact may be one of another face
 _DRUM = 40.0  # [s] of a push, after which an object has no face
 _CARROT, _AHEAD = 0.5, 1.0  # [rad] of the aim on the circle: omnidirectional or not
 _PAST = 0.35  # [m] of the front beyond the face, at which an approach has failed
@@ -273,20 +275,22 @@ def step(
     # The box. It moves with the front while this touches.
     change = jnp.where(obs.even, 1.0, jnp.where(state.t_even > 0, -2.0, -1.0)) * touch.period
     t_even = jnp.where(feels, jnp.clip(state.t_even + change, _UNEVEN - 0.1, 1.5), state.t_even)
+    is_uneven = feels & (t_even <= _UNEVEN)
     h = state.h + jnp.where(
         feels & (state.t_lost < 0.1), grid @ (p_world_front - state.p_world_front), 0.0
     )
     fronts, bases = grid @ (p_world_front - goal), grid @ (base - goal)
     along, across = turned(fronts, leg)[:2]
-    box = Box(h, state.known, state.centred)
+    box = Box(h, state.known & ~is_uneven, state.centred)
     felt = feel(params.r, box.turned(leg), along, across, obs, t_even).turned(-leg % 4)
     middle = p_world_contact + params.r * planar.unit(yaw + normal)
-    forgets = (first & ~jnp.any(state.known)) | (feels & (t_even <= _UNEVEN))
+    # Where the end of the front is dead, only the side feels the object.
+    forgets = (first | (pushing & touches & ~on_front)) & ~jnp.any(state.known)
+    forgets |= is_uneven & (obs.ends[0] - obs.ends[1] < _NARROW)
     square = unknown_box(grid @ (middle - goal) + params.r)
     h, known, centred = soft.tree_where(forgets, square, soft.tree_where(feels, felt, box))
 
-    grows = touches & ~known
-    h = jnp.where(grows, jnp.maximum(h, grid @ (p_world_contact - goal)), h)
+    h = jnp.where(touches & ~known, jnp.maximum(h, grid @ (p_world_contact - goal)), h)
 
     # Q4 and Q5.
     (_, y), (_, width) = extents(h)
@@ -308,24 +312,22 @@ def step(
     beyond_line = jnp.where(leg == 1, y, -y)  # positive beyond the line
     is_beside = (leg % 2 == 1) & feels & (beyond_line > -0.004)
     has_looked = both | (state.looks >= params.looks)
-    settled = (state.t_push > 2) & has_looked & ((t_even > 1) | (state.t_push > 6))
-    room = room_of(way_left)
-    is_off = last_leg & feels & settled & may_try
-    is_off &= (jnp.abs(y) > room + 0.01) & (way_left > s_min - 0.1)
+    is_off = last_leg & feels & may_try & has_looked & (state.t_push > 2)
+    is_off &= (t_even > 1) | (state.t_push > 6)
+    is_off &= (jnp.abs(y) > room_of(way_left) + 0.01) & (way_left > s_min - 0.1)
     at_end = last_leg & feels & (way_left < params.stop)
     # A drum is never flush: a long push and a repetition are enough.
-    is_uneven = (t_even < 0.3) & ((state.tries < 1) | (state.t_push < 20))
-    is_blind = (t_even >= 0.3) & ~has_looked
-    off_line = both & (jnp.abs(y) > params.y_miss)
-    misses = at_end & may_try & (is_uneven | is_blind | off_line)
+    is_early = (state.tries < 1) | (state.t_push < 20)
+    is_unsure = jnp.where(t_even < 0.3, is_early, ~has_looked)
+    misses = at_end & may_try & (is_unsure | (both & (jnp.abs(y) > params.y_miss)))
     repeats = is_off | misses
     done = state.done | (at_end & ~misses) | (time > params.t_end)
     chooses = first | is_back | is_beside | repeats
     if is_relative:
         chooses &= oriented
-    room = room_of(way)
-    sideways = jnp.where((jnp.abs(y) > room) & ~is_beside, jnp.where(y > 0, 3, 1), 0)
-    leg_next = jnp.where((way < s_min) & ~is_off & ~is_beside, 2, sideways)
+    sideways = jnp.where(jnp.abs(y) > room_of(way), jnp.where(y > 0, 3, 1), 0)
+    leg_next = jnp.where((way < s_min) & ~is_off, 2, sideways)
+    leg_next = jnp.where(is_beside, 0, leg_next)
     leg = jnp.where(chooses, leg_next, leg)
     tries = state.tries + repeats
     psi = theta + leg * _QUARTER
@@ -350,7 +352,7 @@ def step(
     # Q7: the end of a push.
     edge = jnp.where(t_even > 0, params.l_edge, params.l_turn)
     is_bad = ~on_front | ((jnp.abs(offset) > edge) & (~last_leg | (way_left > 0.2)))
-    t_push = jnp.where(pushing, state.t_push + touches * touch.period, 0.0)
+    t_push = state.t_push + touches * touch.period
     is_lost = (t_lost > 0.6) & (state.t_push > 0)
     failed = pushing & touched & (state.t_push == 0) & ~touches & (along > _PAST - behind)
     # Nothing is felt there: the object lies ahead, perhaps at a dead taxel.
@@ -360,12 +362,13 @@ def step(
     patience = jnp.where(looks > 0, 0.1, 0.4)
     leaves = (touches & is_bad & (t_push > patience)) | is_lost | failed | turns | wants
     leaves &= pushing & touched
-    hits = (state.mode == AROUND) & touches
-    lands = hits & on_front & ~is_bad & is_facing & ~turns
+    around, near_face = state.mode == AROUND, omni & (jnp.abs(face) < 0.1)
+    hits = around & touches
+    lands = hits & ~is_bad & is_facing & ~turns
     stops = hits & ~lands & (on_front | omni)
     gap = jnp.sum((p_world_contact - p_world_front) * u)
-    back = jnp.where((jnp.abs(face) < 0.1) & omni, 0.04, params.back)
     at_side = omni & (jnp.abs(contact[1]) > 0.26)
+    back = jnp.where(near_face, 0.04, params.back)
     is_clear = (state.mode == BACK) & ((gap > back) | (at_side & (t_lost > 2)))
 
     # Q8, of the base's middle or of its axle.
@@ -373,11 +376,11 @@ def step(
     m = goal + middle_along * ahead_u + aim_across * left_u
     p_world_axle = base - axle * u
     away = p_world_axle - m
-    is_short = jnp.abs(planar.wrap(psi + jnp.pi - planar.direction(away))) < 2.4
-    may_choose = (state.mode != AROUND) | (omni & is_short)
+    is_short = jnp.abs(planar.wrap(psi - planar.direction(-away))) < 2.4
+    may_choose = ~around | (omni & is_short)
     phi, turn, side = turn_around(psi, away, state.side, may_choose)
     carrot = _CARROT if omni else _AHEAD
-    behind_face = omni & (jnp.abs(face) < 0.1) & (along < -behind - 0.02) & (jnp.abs(offset) < 0.7)
+    behind_face = near_face & (along < -behind - 0.02) & (jnp.abs(offset) < 0.7)
     is_direct = (jnp.abs(turn) < carrot) | behind_face if omni else turn < carrot
     R_s = half[0] + half_length + params.gap + axle
     R = params.R + jnp.hypot(*half) + axle
@@ -395,10 +398,10 @@ def step(
         ends = jnp.abs(planar.wrap(psi - heading - half_turns))
         costs = jnp.abs(errors) + jnp.where(is_direct, ends, _QUARTER)
         gear = jnp.where(costs[1] < costs[0] + 1.3, -1.0, 1.0)
-        gear = jnp.where(state.mode == AROUND, state.gear, gear)
+        gear = jnp.where(around, state.gear, gear)
         error = jnp.where(gear > 0, *errors)
         near = (remaining < 0.04) | ((remaining < 0.2) & (jnp.abs(error) > 1.2))
-    arrives = (state.mode == AROUND) & is_direct & near
+    arrives = around & is_direct & near
     aligned = arrives & (jnp.abs(face) < 0.03)
 
     mode = jnp.where(is_clear, AROUND, state.mode)
@@ -409,7 +412,7 @@ def step(
 
     # Q6 and Q10.
     follows = omni & last_leg & feels & (t_even > 0.3) & has_looked & ~leaves
-    d = params.r * jnp.sin(planar.wrap(yaw - theta))
+    d = params.r * jnp.sin(yaw - theta)
     lateral = soft.where(
         weight, jnp.where(last_leg, -(y + jnp.where(follows, d, 0.0)), 0.0), offset
     )
@@ -421,7 +424,7 @@ def step(
     v_last = jnp.clip(0.5 * way_left, 0.01, params.v_max)
     v_side = jnp.clip(-0.5 * beyond_line, 0.015, params.v_max)
     slow = jnp.where(last_leg, v_last, jnp.where(leg % 2 == 1, v_side, v))
-    v = soft.where(weight, jnp.where(touched, slow, v), v)
+    v = soft.where(weight, slow, v)
     turn_left = planar.wrap(psi + steer - yaw)
     arm = half_length + params.r
     curve = jnp.clip(params.K_e * turn_left, -kappa, kappa)
@@ -436,9 +439,8 @@ def step(
     v_y = jnp.where(may_slide, jnp.clip(gain * lateral, -bound, bound), 0.0)
     v_y -= jnp.where(follows, omega * arm, 0.0)
     # Q7 and Q8.
-    flee = jnp.array([-1.0, 0.0]) * params.v_free
     if omni:
-        speed = jnp.minimum(params.v_free, 1.5 * planar.norm(to_aim))
+        speed = jnp.minimum(params.v_free, 2.2 * planar.norm(to_aim))
         drive = planar.rotate(-yaw, planar.unit(heading) * speed)
         spin = 2 * face
     else:
@@ -446,9 +448,10 @@ def step(
         v_drive = jnp.where(is_large | arrives, 0.0, gear * params.v_free * jnp.cos(error))
         drive = jnp.stack([v_drive, jnp.zeros_like(v_drive)])
         spin = jnp.where(arrives, 2 * face, jnp.where(is_large, jnp.sign(error) * jnp.pi, error))
-    spin = jnp.where(mode == BACK, 0.0, jnp.clip(spin, -params.omega_free, params.omega_free))
-    free_x, free_y = jnp.where(mode == BACK, flee, drive)
-    free = Twist(free_x, free_y, spin), params.v_free, params.omega_free
+    spin = jnp.clip(spin, -params.omega_free, params.omega_free)
+    flee = Twist(-params.v_free, 0.0, 0.0)
+    free = soft.tree_where(mode == BACK, flee, Twist(drive[0], drive[1], spin))
+    free = free, params.v_free, params.omega_free
     push = Twist(v, v_y, omega), fast, params.omega_max
     twist, v_max, omega_max = soft.tree_where(mode == PUSH, push, free)
     v, v_y, omega = (jnp.where(done, 0.0, x) for x in twist)
