@@ -100,7 +100,6 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "floors_steps": ("floor",),
     "floors_*": ("floor", "learned"),
     "drives": ("drives", "wide", "hostile", "real"),
-    "pose_drive*": ("pose_drive",),
     "pose_parity": ("pose",),
     "pose_paths": ("pose", "pose_drive", "path"),
     "pose*": ("pose", "pose_drive"),

@@ -54,14 +54,13 @@ class Paths(Poses):
 
     cases: Sequence[str] = tuple(CASES)
     worlds: int = option(300, 2, 10_000_000)
-    file: str = "pose_paths"
     setting: Setting = field(
         default=Setting("fused", seed=718091, rules=Rules(horizon=600.0)), kw_only=True
     )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return success, times and errors of each row."""
-        return [Table(pose_table(results), name=self.file, merge="worlds", title="Paths")]
+        return [Table(pose_table(results), name="pose_paths", merge="worlds", title="Paths")]
 
 
 paths = call_of(Paths)

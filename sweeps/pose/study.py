@@ -80,14 +80,11 @@ class Poses(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32}
     ROWS: ClassVar[Mapping[str, Case]] = CASES
     CHOICES: ClassVar = {"cases": ROWS}
-    GROWS: ClassVar = ("file",)
 
     cases: Sequence[str] = tuple(CASES)
     """Names of rows."""
     worlds: int = option(10000, 2, 10_000_000)
     """Number of worlds of each row."""
-    file: str = "pose"
-    """Name of the data file."""
     setting: Setting = field(default=Setting("fused", seed=530417), kw_only=True)
 
     @cached_property
@@ -116,8 +113,8 @@ class Poses(PlanStudy[xr.Dataset], TrialStudy[xr.Dataset]):
         """Return success, times and errors of each row, and its failures by mechanism."""
         lost = float(self.setting.rules.max_lost)
         return [
-            Table(pose_table(results), name=self.file, merge="worlds", title="Poses"),
-            Table(failure_table(results, lost), name=f"{self.file}_failures", merge="worlds"),
+            Table(pose_table(results), name="pose", merge="worlds", title="Poses"),
+            Table(failure_table(results, lost), name="pose_failures", merge="worlds"),
         ]
 
 

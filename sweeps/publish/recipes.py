@@ -307,11 +307,6 @@ RECIPES: dict[str, Recipe] = {
         gpu=2,
         section="Flat against round",
     ),
-    "pose_drive*": recipe(
-        "rps sweeps/pose --cases 'wide, boxes | differential | 0.2 m/s' --worlds 1000 "
-        f"--seed 640209 --file pose_drive {_MACHINE}",
-        cores=10,
-    ),
     "pose_paths": recipe(f"rps sweeps/pose/paths.py --worlds 300 {_MACHINE}", cores=35),
     "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 300 {_MACHINE}", cores=10),
     **dict.fromkeys(
