@@ -42,7 +42,8 @@ from rps_jax.robot.base import normal
 from rps_jax.robot.shell import HALF_WIDTH, Shell, side_lengths
 from rps_jax.spec import Named, Spec
 
-# [1] of an even contact: the least and the greatest local mean over the mean; the least mean.
+# [1] of an even contact: the least and the greatest local mean over the mean; the least mean. They
+# were fitted in worlds of `hostile`.
 _EVEN, _PROUD, _PRESSED = 0.6, 1.35, 4.0
 _COVERED = 0.35  # [1] signal over that of the neighbour, of a taxel that the object covers
 _NEVER = -1e9  # excess of a dead taxel over the threshold, in temperatures
