@@ -73,7 +73,7 @@ STALE: dict[str, str] = {
         "exported code tests the bits of numbers for NaN",
     ),
     **dict.fromkeys(
-        ("pose_parity", "pose_paths", "pose_sight"),
+        ("pose_paths", "pose_sight"),
         "the law `pose` got another sense of even contact",
     ),
     "fit_one_push": "a sum in the solver got its former order back, with other last bits",
