@@ -247,6 +247,14 @@ def test_the_ends_of_a_flush_face_are_within_a_third_of_a_taxel():
             assert_allclose(found.ends, [y + half, y - half], atol=0.016)
 
 
+def test_a_contact_without_inner_taxels_is_not_even_however_high_the_threshold():
+    signal = 10.0 * jnp.isin(jnp.arange(42), jnp.array([20, 21]))
+    for threshold in (0.5, 3.0, 9.0):
+        found = skins.ends_of(signal, jnp.ones(42, bool), Shell(), threshold)
+        assert not found.even
+        assert not found.seen.any()
+
+
 def test_an_end_beyond_the_front_is_not_seen():
     for y, seen in ((0.0, [False, False]), (0.2, [False, True]), (-0.2, [True, False])):
         found = ends_at(0.4, y)

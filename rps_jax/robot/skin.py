@@ -301,17 +301,18 @@ def ends_of(
     signal, alive = signal[first : first + count], alive[first : first + count]
     active = (signal > threshold) & alive
     border, empty = jnp.ones(1, bool), jnp.zeros(1, signal.dtype)
-    hidden, beside = _beside(~alive, border), _beside(signal, empty)
-    columns = [*jnp.concatenate(parts).T, signal, *hidden, *beside]
+    hidden, next_to = _neighbours(~alive, border), _neighbours(signal, empty)
+    columns = [*jnp.concatenate(parts).T, signal, *hidden, *next_to]
     table = jnp.stack([x.astype(signal.dtype) for x in columns], axis=-1)
     left, right = _extremes(active, table)
     inner = active & (table[:, 0] < left[0]) & (table[:, 0] > right[0])
     pressure, weight = jnp.where(inner, signal, 0.0), inner.astype(signal.dtype)
     top = jnp.maximum(jnp.sum(pressure) / jnp.maximum(jnp.sum(weight), 1), threshold)
-    sums, weights = (x + sum(_beside(x, empty)) for x in (pressure, weight))
+    sums, weights = (x + sum(_neighbours(x, empty)) for x in (pressure, weight))
     least = jnp.min(jnp.where(inner, sums / jnp.maximum(weights, 1), jnp.inf))
     outer = jnp.maximum(left[2] + left[6], right[2] + right[5]) / 2
     is_even = (least > _EVEN * top) & (outer < _PROUD * top) & (top > _PRESSED)
+    is_even &= jnp.any(inner)
     # Over the inner neighbour, so that a slight tilt is no end; this may be dead.
     inside = jnp.stack([left[6], right[5]])
     inside = jnp.where(inside > threshold, jnp.minimum(inside, top), top)
@@ -323,7 +324,7 @@ def ends_of(
     return Ends(ends, seen & is_even, is_even, front)
 
 
-def _beside(values: Array, border: Array) -> Pair:
+def _neighbours(values: Array, border: Array) -> Pair:
     """Return the values (n,) of the previous and of the next taxel, with that beyond the border."""
     return jnp.concatenate([border, values[:-1]]), jnp.concatenate([values[1:], border])
 
