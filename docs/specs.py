@@ -10,8 +10,6 @@ import griffe
 
 from rps_jax.spec import Spec, specs_of
 
-_LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-
 
 class Specs(griffe.Extension):
     """Replace `Annotated[TYPE, Spec(...)]` of an attribute by its type and a docstring."""
@@ -30,9 +28,10 @@ class Specs(griffe.Extension):
 
 def text_of(spec: Spec) -> str:
     """Return meaning, unit and limits of a declaration as a sentence."""
-    limits = [(words, getattr(spec, name)) for name, words in _LIMITS.items()]
-    finite = [f"{words} {x:g}" for words, x in limits if x is not None and abs(x) < math.inf]
+    bounds = spec.bounds
+    unit = bounds.pop("unit", "")
     text = f"{spec.about[:1].upper()}{spec.about[1:]}".removesuffix(".")
-    if spec.unit not in ("", "1") and f"[{spec.unit}]" not in text:
-        text += f" [{spec.unit}]"
-    return "; ".join([text, *finite]) + "."
+    if unit and f"[{unit}]" not in text:
+        text += f" [{unit}]"
+    limits = [f"{name.replace('_', ' ')} {x:g}" for name, x in bounds.items() if abs(x) < math.inf]
+    return "; ".join([text, *limits]) + "."

@@ -126,13 +126,17 @@ def check_task(params: LawParams, task: str, room: float, follows: bool) -> None
 
     This leaves it `room` [m] around the object, and its target moves if the law `follows` it.
     """
-    law, name = law_of(params), f"{task} with the law {_name_of(params)}"
+    law, rule = law_of(params), ""
     if follows and law.heading and not law.follows:
-        rule = "its target moves along a path, which the law does not follow; choose path_pose"
-        raise errors.not_allowed("task", name, f"{rule}, and heading=... for the path's end")
-    if law.room > room:
-        rule = f"its detours need {law.room:g} m without walls around the object, not {room:g} m"
-        raise errors.not_allowed("task", name, f"{rule}; choose a wider one, or another law")
+        rule = (
+            "its target moves along a path, which the law does not follow; choose path_pose, and "
+        )
+        rule += "heading=... for the path's end"
+    elif law.room > room:
+        rule = f"its detours need {law.room:g} m without walls around the object, not {room:g} m; "
+        rule += "choose a wider one, or another law"
+    if rule:
+        raise errors.not_allowed("task", f"{task} with the law {_name_of(params)}", rule)
 
 
 def check_drive(params: LawParams, drive: DriveKind) -> None:

@@ -170,7 +170,7 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
     """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials), or evolution."""
     counts: tuple[int, ...] = tuple(n for n in COUNTS if n != 18)
     """Numbers of tuned parameters: 6 and 13 of RPS, 64, 512, 2048 and 4097 of laws with tables, or
-    18 of RPS+ for one robot, which have a data file of their own."""
+    18 of RPS+ for one robot. A run with one number has a separate data file."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
     simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
@@ -227,8 +227,8 @@ class Race(CollectedStudy, SimulationQuestion[xr.Dataset]):
         _, firsts, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
         chosen = [law_of(best[at], start) for at in firsts]
         options = {"split": "test", "setting": self.setting, "progress": False}
-        options |= {"robot": COUNTS[count].get("robot")}
-        scores = evaluate([start, *chosen], domain, self.worlds, **options)
+        robot = COUNTS[count].get("robot")
+        scores = evaluate([start, *chosen], domain, self.worlds, robot=robot, **options)
         coords = {"seed": self.seeds, "method": self.methods, "budget": self.simulated}
         dims, shape = (*coords,), (*map(len, coords.values()),)
         wall = np.reshape([row.wall for row in best], shape)

@@ -16,10 +16,11 @@ offsets e_left and e_right of the ends of an even contact:
       unknown side reaches as far as any contact; the first touch of another face keeps the middle
       of its axis, if that was felt
 
-After a second of uneven contact no side is known. If it is narrow, another face may be there: then
-the box is a square of half width r behind the contact. A wide one is only tilted a little, and the
-supports stay. Where no side is known, a push that the side of the base feels puts the square beside
-it. Let g = h_2 be the way that is left, and m the middle of the box, left of the goal's line by y.
+After a second of uneven contact no side is known. If the contact is narrow, another face may be
+there: then the box is a square of half width r behind the contact. A wide contact is only tilted a
+little, and the supports stay. Where no side is known, a push that the side of the base feels puts
+the square beside it. Let g = h_2 be the way that is left, and m the middle of the box, left of the
+goal's line by y.
 
   Q4  leg: k = 2 if g < s_min, or s_flush where a side is known;  else k = 1 or 3 towards y = 0 if
       |y| > y_tol + cap g + reach kappa (g - s_line)^2 / 4;  else k = 0
