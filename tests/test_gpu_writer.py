@@ -1,6 +1,7 @@
 """CUDA gives the results of JAX, on an emulated warp."""
 
 import ctypes
+import functools
 import re
 import shutil
 from pathlib import Path
@@ -91,6 +92,20 @@ def test_operations_agree_with_jax(threads, tmp_path):
         for actual, desired in zip(*map(jax.tree.leaves, (a, b)), strict=True):
             assert actual.dtype == desired.dtype
             assert_allclose(actual, desired, rtol=3e-6, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_function_that_is_a_scan_is_a_loop_over_rows(reverse, tmp_path):
+    def step(carry, row):
+        x, count = carry
+        return (row * jnp.cumsum(x)[::-1], count + 1), (x, count * row)
+
+    scan = functools.partial(jax.lax.scan, step, reverse=reverse)
+    x = jnp.linspace(-1, 1, 63).reshape(9, 7)
+    inputs = (x, jnp.arange(9)), x[:, :3]
+    run = Emulated(scan, jax.tree.map(lambda a: a[0], inputs), tmp_path, 4)
+    assert "count < 3" in run.text
+    jax.tree.map(assert_allclose, run(*inputs), jax.vmap(scan)(*inputs))
 
 
 def test_tables_hold_numbers_that_are_not_finite(monkeypatch):

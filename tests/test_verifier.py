@@ -24,6 +24,7 @@ from rps_jax.lowering.graph import (
     live_nodes,
     nodes_of,
 )
+from rps_jax.lowering.walk import Rows
 
 
 def function(x, i):
@@ -37,7 +38,7 @@ def graph():
     """Return the results of the function."""
     shapes = [jax.ShapeDtypeStruct((5,), np.float32), jax.ShapeDtypeStruct((2,), np.int32)]
     closed, outs = jax.make_jaxpr(function, return_shape=True)(*shapes)
-    return results(closed, shapes, outs, SimdBuilder())[0]
+    return results(Rows(closed), shapes, outs, SimdBuilder())[0]
 
 
 def nodes(outputs):

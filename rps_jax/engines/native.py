@@ -27,18 +27,17 @@ import tempfile
 import threading
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Collection, Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
-from jax.flatten_util import ravel_pytree
 from jax.interpreters import ad, batching, mlir
 
 from rps_jax.engines import device
@@ -47,6 +46,7 @@ from rps_jax.geometry.arrays import Array, Pytree
 from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu import WARP, GpuWriter, shared_size
 from rps_jax.lowering.graph import CompilerError, TooLargeError, UnsupportedError, first_array
+from rps_jax.lowering.walk import Rows
 from rps_jax.lowering.writer import HANDLER, SimdWriter
 from rps_jax.record import cache
 
@@ -111,12 +111,7 @@ def target() -> str | None:
     return (gpu := nvrtc.target()) and f"{macros} {gpu}"
 
 
-def batched(
-    function: Function,
-    fallback: Function,
-    residuals: Literal["none", "derivatives", "always"] = "none",
-    strict: bool = False,
-) -> Function:
+def batched(function: Function, fallback: Function, has_residuals: bool = False) -> Function:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
 
     Its derivatives in both modes are compiled as the function itself is.
@@ -124,15 +119,12 @@ def batched(
     Args:
       function: the function of one world; pure.
       fallback: the same function of a batch, which XLA compiles where `function` is not compiled.
-      residuals: unless `none`, `function` is a function of a tuple of arguments and of residuals,
-        and returns results and residuals: numbers that it computes if it gets (), and from which,
-        as constants, its derivatives are faster. With `derivatives` it gets None where it is not
-        differentiated; with `always` it gets () there, too, so that no other function is compiled.
-      strict: raise TooLargeError where XLA would compile, instead of calling `fallback`.
+      has_residuals: whether `function` is a function of a tuple of arguments and of residuals, and
+        returns results and residuals: numbers that it computes if it gets (), and from which, as
+        constants, its derivatives are faster. Where it is not differentiated it gets None.
     """
     if not is_available():
         return fallback
-    has_residuals = residuals != "none"
 
     def evaluate(arguments: Pytree, residuals: Pytree) -> tuple[Pytree, Pytree]:
         return function(arguments, residuals) if has_residuals else (function(*arguments), ())
@@ -143,21 +135,34 @@ def batched(
     def plain(*arguments: Pytree) -> Pytree:
         return evaluate(arguments, None)[0]
 
-    run_plain = concurrent([plain], lambda arguments: [fallback(*arguments)], strict=strict)
-    run = concurrent(
-        [with_residuals], lambda arguments: [jax.vmap(with_residuals)(*arguments)], strict=strict
-    )
-
     @jax.custom_jvp
     def call(*arguments: Pytree) -> Pytree:
-        return run(arguments)[0][0] if residuals == "always" else run_plain(arguments)[0]
+        return _computed(plain, arguments, fallback)
 
     def rule(primals: Pytree, tangents: Pytree) -> tuple[Pytree, Pytree]:
-        results, saved = run(primals)[0] if has_residuals else (call(*primals), ())
-        return results, _tangents(lambda *x: evaluate(*x)[0], primals, saved, tangents, results)
+        results, saved = call(*primals), ()
+        if has_residuals:
+            results, saved = _computed(with_residuals, primals)
+        leaves, tree = jax.tree.flatten((primals, saved))
+        varied = varied_indices(directions := jax.tree.leaves(tangents))
+        maps = _maps(lambda values: evaluate(*tree.unflatten(values))[0], varied, results)
+        forward, transpose = (batched(f, jax.vmap(f)) for f in maps)
+        vectors = [directions[i] for i in varied]
+        return results, _tangents(forward, transpose, leaves, vectors, results)
 
     call.defjvp(rule, symbolic_zeros=True)
     return call
+
+
+def _computed(
+    function: Function,
+    arguments: Sequence[Pytree],
+    fallback: Function | None = None,
+    strict: bool = False,
+) -> Pytree:
+    """Return the results of a batch for a function of one world: see `concurrent`."""
+    in_xla = fallback or jax.vmap(function)
+    return concurrent([function], lambda x: [in_xla(*x)], strict=strict)(tuple(arguments))[0]
 
 
 def compared(function: Function, types: Sequence[Pytree], compare: Callable[[], str]) -> str:
@@ -211,10 +216,9 @@ def scan(
     constants: Pytree,
     length: int,
 ) -> tuple[Pytree, Pytree]:
-    """Return `jax.lax.scan` of a batch of worlds (B, ...) by one native function for each step.
+    """Return `jax.lax.scan` of a batch of worlds (B, ...) by one native function for all steps.
 
-    A loop reads and writes few arrays: those of the state and of the constants, each with one array
-    for each type of number, and one more of the constants that are differentiated.
+    So are its derivatives.
 
     Args:
       step: of one world, from state, constants and the residuals of `batched`. It returns state
@@ -226,72 +230,72 @@ def scan(
     Raises:
       TooLargeError: the step is not compiled here.
     """
-    leaves, tree = jax.tree.flatten((state, constants))
-    count = len(jax.tree.leaves(state))
 
-    def run(values: list[Array], varied: Collection[int] | None = None) -> Pytree:
-        groups: dict[tuple[object, ...], list[int]] = {}  # of the state, then of the constants
-        for i, x in enumerate(values):
-            key = i >= count, x.dtype, i >= count and i in (varied or ())
-            groups.setdefault(key, []).append(i)
-        carried = sum(not is_constant for is_constant, *_ in groups)
-        restore: Pytree = [ravel_pytree([values[i][0] for i in x])[1] for x in groups.values()]
+    def run(inputs: tuple[Pytree, Pytree], residuals: Pytree) -> tuple[Pytree, Pytree]:
+        def whole(state: Pytree, constants: Pytree) -> tuple[Pytree, Pytree]:
+            def next_row(state: Pytree, _: None) -> tuple[Pytree, Pytree]:
+                (end, output), computed = step(state, constants, residuals)
+                return end, output if residuals is None else (output, (state, computed))
 
-        def packed(leaves: Sequence[Array], indices: Sequence[list[int]]) -> list[Array]:
-            return [ravel_pytree([leaves[i] for i in x])[0] for x in indices]
+            return jax.lax.scan(next_row, state, length=length)
 
-        def unpacked(arrays: Sequence[Array], indices: Sequence[list[int]]) -> list[Array]:
-            parts = [f(x) for f, x in zip(restore, arrays, strict=False)]
-            pairs = zip(itertools.chain(*indices), itertools.chain(*parts), strict=True)
-            return [x for _, x in sorted(pairs, key=operator.itemgetter(0))]
+        return _computed(whole, inputs, strict=True)
 
-        indices = list(groups.values())
-
-        def packed_step(arguments: Pytree, residuals: Pytree) -> tuple[Pytree, Pytree]:
-            state, constants = tree.unflatten(unpacked([*arguments[0], *arguments[1]], indices))
-            (state, output), residuals = step(state, constants, residuals)
-            return (packed(jax.tree.leaves(state), indices[:carried]), output), residuals
-
-        arrays = jax.vmap(lambda x: packed(x, indices))(values)
-        residuals = "derivatives" if varied is None else "always"
-        single = jax.vmap(lambda *x: packed_step(x, None)[0])
-        call = batched(packed_step, single, residuals, strict=True)
-        end, outputs = jax.lax.scan(
-            lambda x, _: call(x, arrays[carried:]), arrays[:carried], length=length
-        )
-        end = jax.vmap(lambda x: unpacked(x, indices[:carried]))(end)
-        return jax.tree.structure(state).unflatten(end), outputs
+    call = jax.custom_jvp(lambda *inputs: run(inputs, None))
 
     def rule(primals: Pytree, tangents: Pytree) -> Pytree:
-        ((values,), (directions,)) = primals, tangents
-        indices = varied_indices(directions)
-        of_varied, point = restrict(functools.partial(run, varied=indices), values, indices)
-        return jax.jvp(of_varied, (point,), ([directions[i] for i in indices],))
+        states, constants = (jax.tree.leaves(x) for x in primals)
+        end, (outputs, rows) = run(primals, ())
+        saved, tree = jax.tree.flatten((rows, primals[1]))
+        varied = varied_indices(directions := jax.tree.leaves(tangents))
+        carried, scanned = _real_indices(states), len(saved) - len(constants)
+        vectors = [directions[i] if i in varied else jnp.zeros_like(states[i]) for i in carried]
+        vectors += [directions[i] for i in varied if i >= len(states)]
+        fixed = [i - len(states) + scanned for i in varied if i >= len(states)]
+        count = len(carried)
 
-    call = jax.custom_jvp(lambda values: run(values))
+        def results(values: Sequence[Pytree]) -> Pytree:
+            (state, residuals), constants = tree.unflatten(values)
+            return step(state, constants, residuals)[0]
+
+        push, pull = _maps(results, [*carried, *fixed], (end, outputs))
+
+        def push_all(saved: Sequence[Pytree], vectors: Sequence[Pytree]) -> Pytree:
+            def push_row(moved: Pytree, row: Pytree) -> tuple[Pytree, Pytree]:
+                moved = push([*row, *saved[scanned:]], [*moved, *vectors[count:]])
+                return moved[:count], moved[count:]
+
+            end, outputs = jax.lax.scan(push_row, [*vectors[:count]], saved[:scanned])
+            return *end, *outputs
+
+        def pull_all(saved: Sequence[Pytree], start: Pytree, rows: Sequence[Pytree]) -> Pytree:
+            def pull_row(carry: list[Pytree], row: Pytree) -> tuple[list[Pytree], Pytree]:
+                moved = pull([*row[0], *saved[scanned:]], [*carry[:count], *row[1]])
+                return [*moved[:count], *map(operator.add, carry[count:], moved[count:])], ()
+
+            return jax.lax.scan(pull_row, start, (saved[:scanned], rows), reverse=True)[0]
+
+        def transpose(saved: Sequence[Array], vectors: Sequence[Array]) -> list[Array]:
+            start = [*vectors[:count], *(jnp.zeros_like(saved[i]) for i in fixed)]
+            return _computed(pull_all, (saved, start, vectors[count:]))
+
+        maps = lambda *inputs: _computed(push_all, inputs), transpose
+        return (end, outputs), _tangents(*maps, saved, vectors, (end, outputs))
+
     call.defjvp(rule, symbolic_zeros=True)
-    return call(leaves)
+    end, outputs = call(*jax.tree.map(jnp.asarray, (state, constants)))
+    return end, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), outputs)
 
 
-def _tangents(
-    function: Callable[[Pytree, Pytree], Pytree],
-    arguments: Pytree,
-    residuals: Pytree,
-    tangents: Pytree,
-    results: Pytree,
-) -> Pytree:
-    """Return the tangents of the results of a function of one world, in a batch of worlds.
+def _maps(function: Function, varied: Sequence[int], results: Pytree) -> tuple[Map, Map]:
+    """Return the tangent map of a function of a list of values of one world, and its transpose.
 
-    The function's second argument, the residuals, is constant.
+    They map vectors of the `varied` values to those of its real results, and back.
     """
-    leaves, tree = jax.tree.flatten((arguments, residuals))
-    result_leaves, result_tree = jax.tree.flatten(results)
-    directions = jax.tree.leaves(tangents)
-    varied = varied_indices(directions)
-    real = [i for i, x in enumerate(result_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
+    real = _real_indices(jax.tree.leaves(results))
 
     def real_results(values: Sequence[Pytree]) -> list[Pytree]:
-        leaves = jax.tree.leaves(function(*tree.unflatten(values)))
+        leaves = jax.tree.leaves(function(values))
         return [leaves[i] for i in real]
 
     def push(values: Sequence[Pytree], vectors: Sequence[Pytree]) -> list[Pytree]:
@@ -302,12 +306,23 @@ def _tangents(
         of_varied, point = restrict(real_results, values, varied)
         return jax.vjp(of_varied, point)[1](list(vectors))[0]
 
-    forward, transpose = (batched(f, jax.vmap(f)) for f in (push, pull))
-    vectors, templates = [directions[i] for i in varied], [result_leaves[i] for i in real]
-    outputs = linear_map(forward, transpose, leaves, vectors, templates)
+    return push, pull
+
+
+def _real_indices(arrays: Sequence[Array]) -> list[int]:
+    return [i for i, x in enumerate(arrays) if jnp.issubdtype(x.dtype, jnp.floating)]
+
+
+def _tangents(
+    forward: Map, transpose: Map, saved: Sequence[Array], vectors: Sequence[Array], results: Pytree
+) -> Pytree:
+    """Return the tangents of results: those of the real ones by a linear map of vectors."""
+    leaves, tree = jax.tree.flatten(results)
+    real = _real_indices(leaves)
+    outputs = linear_map(forward, transpose, saved, vectors, [leaves[i] for i in real])
     values = dict(zip(real, outputs, strict=True))
-    zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in result_leaves]
-    return result_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
+    zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in leaves]
+    return tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
 
 
 def concurrent(
@@ -482,6 +497,8 @@ def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
       TooLargeError: a kernel needs too much shared memory.
     """
     fewest, most = _THREADS
+    if Rows.of(functions[0].trace.jaxpr).length > 1:
+        fewest *= 2  # gradients are of too few worlds to fill a GPU
     with contextlib.suppress(TooLargeError):
         return fewest, _printed(functions, GpuWriter, fewest)
     return most, _printed(functions, GpuWriter, most)

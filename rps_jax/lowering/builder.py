@@ -12,7 +12,6 @@ from collections.abc import Hashable, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 
 from rps_jax.lowering.graph import (
     DTYPES,
@@ -54,7 +53,7 @@ from rps_jax.lowering.graph import (
     view_of,
 )
 from rps_jax.lowering.operations import SIMD_HEADER, defined
-from rps_jax.lowering.walk import reduced_by_rows, sliding_windows, walk
+from rps_jax.lowering.walk import Rows, reduced_by_rows, sliding_windows, walk
 
 # Initial value of a reduction, by its operation and kind.
 INITIAL = {
@@ -273,18 +272,20 @@ class SimdBuilder(GraphBuilder):
 
 
 def results(
-    closed: ClosedJaxpr, shapes: Sequence[Typed], outs: Sequence[Typed], target: GraphBuilder
+    rows: Rows, shapes: Sequence[Typed], outs: Sequence[Typed], target: GraphBuilder
 ) -> tuple[list[Result], list[Node]]:
-    """Return the results of a closed jaxpr of arguments of these types, and their nodes."""
-    inputs = [
-        target.input(i, x.shape, x.dtype) if size_of(x.shape) else np.zeros(x.shape, x.dtype)
-        for i, x in enumerate(shapes)
-    ]
+    """Return the results of a function of arguments of these types, and their nodes."""
+    inputs = []
+    for i, x in enumerate(shapes):
+        shape = x.shape[i in rows.scanned :]
+        is_empty = not size_of(shape)
+        inputs.append(np.zeros(shape, x.dtype) if is_empty else target.input(i, shape, x.dtype))
+    if rows.operands is not None:
+        inputs = [inputs[x] if isinstance(x, int) else x for x in rows.operands]
     returned = []
-    for i, (value, template) in enumerate(zip(walk(closed, inputs, target), outs, strict=True)):
-        if size := size_of(template.shape):
-            kind = target.kind(template.dtype, "a result")
-            returned.append(Result(i, flat(value, size), size, kind))
+    for i, (value, x) in enumerate(zip(walk(rows.body, inputs, target), outs, strict=True)):
+        if size := size_of(x.shape[i in rows.stacked :]):
+            returned.append(Result(i, flat(value, size), size, target.kind(x.dtype, "a result")))
     return returned, nodes_of([result.value for result in returned])
 
 

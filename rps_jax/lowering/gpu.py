@@ -147,7 +147,11 @@ extern "C" __global__ void __launch_bounds__(256) step(const __grid_constant__ A
   if (number - world >= a.worlds) return;
   const bool exists = number < a.worlds;
   const long long index = exists ? number : a.worlds - 1, at = {WORLD};
+  for (int count = 0; count < {LENGTH}; count++) {{
+  if (count) __syncthreads(); /* so that the warps fetch the same instructions */
+  const long long row = at * {LENGTH} + {STEP};
 {LINES}
+  }}
 }}
 """
 # Reductions over threads; `gpu.h` has the sum of reals.
@@ -321,7 +325,11 @@ class GpuWriter(SimdWriter):
     def element_text(self, node: Node, fused: set[Node]) -> tuple[list[str], str]:
         op, size, at = node.op, node.size, "i" if node.size > 1 else "0"
         if isinstance(op, Input):
-            stored = f"((const {STORED[node.kind]} *)a.inputs[{op.index}])[at * {size} + {at}]"
+            world = "row" if op.index in self.rows.scanned else "at"
+            source = f"a.inputs[{op.index}]"
+            if op.index in self.rows.carried:
+                source = f"(count ? a.outputs[{self.rows.carried.index(op.index)}] : {source})"
+            stored = f"((const {STORED[node.kind]} *){source})[{world} * {size} + {at}]"
             return [], f"{stored} != 0" if node.kind == "b" else stored
         if isinstance(op, DynamicSlice):
             index, source = node.operands
@@ -383,10 +391,13 @@ class GpuWriter(SimdWriter):
 
     def end(self, result: Result) -> list[str]:
         position, a, size, kind = result
-        stored = f"(({STORED[kind]} *)a.outputs[{position}])[at * {size} + i]"
+        world = "row" if position in self.rows.stacked else "at"
+        stored = f"(({STORED[kind]} *)a.outputs[{position}])[{world} * {size} + i]"
         guard = f" && {self._guard(size)}" if self._guard(size) else ""
         lines = [
             f"  {self.declaration(kind, 'e')} = {self.read(a, size)};",
             f"  if (exists{guard}) {stored} = e;",
         ]
-        return self.statement(self.elements(size, lines))
+        # Other threads may still read the last step's number.
+        waits = ["__syncwarp();"] * (position < len(self.rows.carried))
+        return self.statement([*waits, *self.elements(size, lines)])

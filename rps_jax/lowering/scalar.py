@@ -35,6 +35,7 @@ from rps_jax.lowering.graph import (
     nodes_of,
 )
 from rps_jax.lowering.routine import Routine
+from rps_jax.lowering.walk import Rows
 from rps_jax.lowering.writer import Writer
 
 _LARGE = 256  # weights of a matrix from which on a product is a loop over its rows
@@ -205,9 +206,8 @@ class ScalarWriter(Writer):
         self._inputs = [(f"{text}{field.name}", field) for text, field in fields]
         outputs = [(group, x) for group, fields in routine.outputs.items() for x in fields]
         target = self.builder(self.spelling)
-        values, roots = results(
-            routine.jaxpr, [x.type for _, x in fields], [x.type for _, x in outputs], target
-        )
+        types, outs = ([x.type for _, x in group] for group in (fields, outputs))
+        values, roots = results(Rows(routine.jaxpr), types, outs, target)
         nodes = sink_products(roots)
         self.body = self.lines(nodes, roots)
         known = {result.position: result.value for result in values}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -269,18 +269,55 @@ def _fold(eqn: JaxprEqn, arrays: list[Value]) -> list[Value]:
     return [x if _is_key(x) else np.asarray(x) for x in results]
 
 
+class Rows(NamedTuple):
+    """Function that is printed; of a scan, one step, which reads and writes rows of arrays."""
+
+    body: ClosedJaxpr
+    operands: Values | None = None  # of a step: indices of arguments, and constants
+    carried: Values = ()  # arguments that are the first results of the last step
+    scanned: Values = ()  # arguments that have a row for each step
+    stacked: Sequence[int] = ()  # results that have one
+    length: int = 1
+    reverse: bool = False
+
+    @classmethod
+    def of(cls, closed: ClosedJaxpr) -> Rows:
+        """Return the step of a function that is one scan of its arguments, else the function."""
+        jaxpr, eqn = closed.jaxpr, closed.jaxpr.eqns[0] if len(closed.jaxpr.eqns) == 1 else None
+        if eqn is None or eqn.primitive.name != "scan" or eqn.outvars != jaxpr.outvars:
+            return cls(closed)
+        known = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
+        known |= {x: i for i, x in enumerate(jaxpr.invars)}
+        operands = [np.asarray(x.val) if isinstance(x, Literal) else known[x] for x in eqn.invars]
+        indices = [x for x in operands if isinstance(x, int)]
+        fixed, carried = _counts(eqn)
+        starts, scanned = operands[fixed : fixed + carried], operands[fixed + carried :]
+        if len(set(indices)) < len(indices) or any(map(is_constant, starts + scanned)):
+            return cls(closed)
+        params, stacked = eqn.params, range(carried, len(eqn.outvars))
+        steps = params["length"], params["reverse"]
+        return cls(params["jaxpr"], operands, starts, scanned, stacked, *steps)
+
+
+def _counts(eqn: JaxprEqn) -> tuple[int, int]:
+    """Return the numbers of the constants and of the carried values of a scan.
+
+    Versions of JAX differ in the names of these counts. Carried values have the same shape inside
+    and outside of the body; scanned and stacked values have not.
+    """
+    body = eqn.params["jaxpr"]
+    pairs = (_types(eqn.invars), body.in_avals), (_types(eqn.outvars), body.out_avals)
+    equal, carried = (sum(x.shape == y.shape for x, y in zip(*z, strict=True)) for z in pairs)
+    return equal - carried, carried
+
+
 def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
     """Emit a loop for a `fori_loop` or a large body, and unroll any other `scan`."""
     params = eqn.params
     length, body = params["length"], params["jaxpr"]
     if length > _MAX_STEPS:
         raise UnsupportedError(f"scan of more than {_MAX_STEPS} steps")
-    # Versions of JAX differ in the names of these counts. Carried values have the same shape
-    # inside and outside of the body; scanned and stacked values have not.
-    results = zip(_types(eqn.outvars), body.out_avals, strict=True)
-    carried = sum(out.shape == inner.shape for out, inner in results)
-    starts = zip(values, body.in_avals, strict=True)
-    fixed = sum(np.shape(value) == inner.shape for value, inner in starts) - carried
+    fixed, carried = _counts(eqn)
     consts, carry = values[:fixed], values[fixed : fixed + carried]
     if len(values) == fixed + carried == fixed + len(body.out_avals):
         loop = target.for_loop(_with_consts(body, consts, target), carry, length)

@@ -33,6 +33,7 @@ from rps_jax.lowering.graph import (
     nodes_of,
 )
 from rps_jax.lowering.operations import SIMD_HEADER, TYPES
+from rps_jax.lowering.walk import Rows
 
 
 class Writer:
@@ -316,11 +317,12 @@ STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of
 _FUNCTION = """\
 
 {TABLES}
-static void run_lanes(void **inputs, void **outputs, int64_t first, int64_t worlds) {{
-  int64_t at[LANES];
+static void run_lanes(void **inputs, void **outputs, int64_t first, int64_t worlds, int step) {{
+  int64_t at[LANES], row[LANES];
   for (int l = 0; l < LANES; l++) {{
     const int64_t index = first + l < worlds ? first + l : worlds - 1;
     at[l] = {WORLD};
+    row[l] = at[l] * {LENGTH} + step;
   }}
 {LINES}
 }}
@@ -331,7 +333,11 @@ XLA_FFI_Error *{NAME}(XLA_FFI_CallFrame *frame) {{
   for (int i = 0; i < {INPUTS}; i++) inputs[i] = ((XLA_FFI_Buffer *)frame->args.args[i])->data;
   for (int i = 0; i < {OUTPUTS}; i++) outputs[i] = ((XLA_FFI_Buffer *)frame->rets.rets[i])->data;
   const int64_t worlds = count_worlds(frame->args.args[{SIZED}], {SIZE});
-  for (int64_t first = 0; first < worlds; first += LANES) run_lanes(inputs, outputs, first, worlds);
+  for (int count = 0; count < {LENGTH}; count++) {{
+    for (int64_t first = 0; first < worlds; first += LANES)
+      run_lanes(inputs, outputs, first, worlds, {STEP});
+    {NEXT}
+  }}
   return 0;
 }}
 """
@@ -343,6 +349,7 @@ class SimdWriter(Writer):
     table_type = "static const"
     function, inputs = _FUNCTION, "inputs"
     builder: type[GraphBuilder] = SimdBuilder
+    rows: Rows
 
     def constant(self, text: str, kind: str) -> str:
         return f"all_{kind}({text})"
@@ -356,7 +363,9 @@ class SimdWriter(Writer):
     def single(self, node: Node) -> list[str]:
         offset = f"* {node.size} + i]"
         if isinstance(node.op, Input):
-            text = f"((const {STORED[node.kind]} *)inputs[{node.op.index}])[at[l] {offset}"
+            index = node.op.index
+            world = "row" if index in self.rows.scanned else "at"
+            text = f"((const {STORED[node.kind]} *)inputs[{index}])[{world}[l] {offset}"
             text = f"-(int){text}" if node.kind == "b" else text
         elif isinstance(node.op, DynamicSlice):
             index, source = node.operands
@@ -371,10 +380,11 @@ class SimdWriter(Writer):
         """Return the statements that store a result."""
         position, a, size, kind = result
         stored, truth = STORED[kind], " != 0" * (kind == "b")
+        world = "row" if position in self.rows.stacked else "at"
         lines = [
             f"  {self.declaration(kind, 'e')} = {self.read(a, size)};",
             "  for (int l = 0; l < LANES && first + l < worlds; l++)",
-            f"    (({stored} *)outputs[{position}])[at[l] * {size} + i] = e[l]{truth};",
+            f"    (({stored} *)outputs[{position}])[{world}[l] * {size} + i] = e[l]{truth};",
         ]
         return self.elements(size, lines)
 
@@ -397,7 +407,8 @@ class SimdWriter(Writer):
           UnsupportedError: it has an operation that is not in the headers.
           TooLargeError: a kernel needs too much shared memory.
         """
-        returned, roots = results(closed, shapes, outs, self.builder())
+        self.rows = rows = Rows.of(closed)
+        returned, roots = results(rows, shapes, outs, self.builder())
         nodes, (sized, size) = live_nodes(roots), first_array(shapes)
         self.assign_storage(nodes, returned)
         lines = self.lines(nodes, roots)
@@ -413,6 +424,9 @@ class SimdWriter(Writer):
             NAME=HANDLER,
             SIZED=sized,
             SIZE=size,
+            LENGTH=rows.length,
+            STEP=f"{rows.length - 1} - count" if rows.reverse else "count",
+            NEXT=" ".join(f"inputs[{x}] = outputs[{i}];" for i, x in enumerate(rows.carried)),
         )
 
     def assign_storage(self, nodes: Iterable[Node], returned: Iterable[Result]) -> None:
