@@ -97,7 +97,8 @@ def signed_distance(footprint: Footprint, point: Float[Array, "*P 2"]) -> Float[
     for i in range(footprint.vertices.shape[0]):
         x, y = point[..., 0] - start[i, 0], point[..., 1] - start[i, 1]
         ahead = along[i] / length2[i]
-        t = jnp.clip(x * ahead[0] + y * ahead[1], 0.0, 1.0)
+        # At the nearest point of an edge, the distance does not change with t.
+        t = jax.lax.stop_gradient(jnp.clip(x * ahead[0] + y * ahead[1], 0.0, 1.0))
         away_x, away_y = x - t * along[i, 0], y - t * along[i, 1]
         square = away_x * away_x + away_y * away_y
         # The derivative of `jnp.minimum` is zero if the compiler computes the operands twice with

@@ -183,19 +183,17 @@ class CapacitiveSkin(NamedTuple):
         alive = jax.random.uniform(key_dead, (n,), jnp.float32) >= self.dead_share
         return SkinState(key, jnp.zeros(n), gain, alive)
 
-    def compression(self, footprint: Footprint) -> Float[Array, "T S"]:
-        """Return the compression of the foam [m] at each sample of each taxel."""
+    def compression(self, footprint: Footprint) -> list[Float[Array, " T"]]:
+        """Return the compression of the foam [m] of all taxels at each of their samples."""
         samples = jnp.asarray(self.shell.taxels(self.shell.samples), footprint.vertices.dtype)
-        # One long axis: a processor fills its vectors along the last axis.
-        line = jnp.swapaxes(samples, 0, 1).reshape(-1, 2)
-        depth = (self.foam - fp.signed_distance(footprint, line)).reshape(samples.shape[1::-1]).T
-        return jnp.clip(depth, 0.0, self.max_compression * self.foam)
+        depths = (self.foam - fp.signed_distance(footprint, x) for x in jnp.swapaxes(samples, 0, 1))
+        return [jnp.clip(x, 0.0, self.max_compression * self.foam) for x in depths]
 
     def _scan(self, state: SkinState, footprint: Footprint) -> tuple[SkinState, Array]:
         """Return the raw signals (T,) [1] of all taxels, with gains and noise."""
-        share = self.foam / (self.foam - self.compression(footprint))
         # A loop over samples: reductions of such short axes are slow on every device.
-        change = sum(share[:, i] for i in range(self.shell.samples)) / self.shell.samples - 1.0
+        shares = [self.foam / (self.foam - x) for x in self.compression(footprint)]
+        change = sum(shares) / len(shares) - 1.0
         key, key_noise = jax.random.split(state.key)
         noise = self.noise * normal(key_noise, change.shape, change.dtype)
         return state._replace(key=key), state.gain * change + noise

@@ -198,4 +198,4 @@ def _compression(skin: Skin, outline: Footprint) -> Array:
     thickness = skin.foam if isinstance(skin, CapacitiveSkin) else skin.tolerance
     foam = jnp.maximum(thickness, 1e-6)
     compression = CapacitiveSkin(foam=foam, shell=skin.shell).compression(outline)
-    return jnp.max(compression, axis=-1) / foam
+    return jnp.max(jnp.stack(compression), axis=0) / foam
