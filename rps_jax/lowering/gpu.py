@@ -8,7 +8,7 @@ in shared memory.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Hashable, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -34,7 +34,6 @@ from rps_jax.lowering.graph import (
     flat,
     gathered_scalar,
     size_of,
-    view_of,
 )
 from rps_jax.lowering.operations import GPU_HEADER, TYPES, defined
 from rps_jax.lowering.writer import STORED, SimdWriter, Writer
@@ -48,45 +47,9 @@ class GpuBuilder(SimdBuilder):
 
     operations = defined(GPU_HEADER)
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._gathers: dict[Hashable, Array] = {}
-
     def stack(self, scalars: Values, kind: str, shape: Shape) -> Array:
-        """Gather scalars; many that the same operation computes become one array operation."""
-        scalars = tuple(map(gathered_scalar, scalars))
-        if len(scalars) <= WARP:
-            return super().stack(scalars, kind, shape)
-        return self._stacked(scalars, kind)._replace(shape=shape)
-
-    def _stacked(self, scalars: tuple[Value, ...], kind: str) -> Value:
-        """Return scalars as one operand."""
-        size = len(scalars)
-        if not any(isinstance(a, Array) for a in scalars):
-            return flat(np.asarray(scalars), size)
-        if view := view_of(scalars, (size,)):
-            return view
-        if not all(isinstance(a, Array) for a in scalars):
-            return super().stack(scalars, kind, (size,))
-        key = tuple((a.node.id, a.first) for a in scalars)
-        if key not in self._gathers:
-            self._gathers[key] = self._vectorised(scalars, kind)
-        return self._gathers[key]
-
-    def _vectorised(self, scalars: tuple[Array, ...], kind: str) -> Array:
-        """Vectorise a gather of scalars: apply their common operation to gathered operands."""
-        first, size, nodes = scalars[0].node, len(scalars), {a.node for a in scalars}
-        operations = {(node.op, len(node.operands)) for node in nodes}
-        op, are_elements = first.op, all(node.is_fusible for node in nodes)
-        if len(operations) > 1 or not are_elements or not isinstance(op, Call):
-            return super().stack(scalars, kind, (size,))
-        operands = [
-            self._stacked(
-                tuple(_operand(a, j) for a in scalars), self.kind(template.dtype, "a gather")
-            )
-            for j, template in enumerate(first.operands)
-        ]
-        return Array(self.node(op, operands, kind, size), (size,))
+        """Gather scalars from the sources of gathers."""
+        return super().stack(tuple(map(gathered_scalar, scalars)), kind, shape)
 
     def apply(self, name: str, values: Values, params: Params, out: Typed) -> Value:
         """Apply a primitive; sums over threads are added before they are exchanged."""
@@ -111,14 +74,6 @@ class GpuBuilder(SimdBuilder):
         partial = [x.operands[0]._replace(shape=out.shape) for x in (lhs, rhs)]
         total = super().apply(name, partial, {}, out)
         return Array(self.node(_SUM, [flat(total, 1)], "f", 1), out.shape)
-
-
-def _operand(a: Array, j: int) -> Value:
-    """Return operand `j` of the operation that computed a single number."""
-    operand = a.node.operands[j]
-    if not isinstance(operand, Array):
-        return np.reshape(operand, -1)[a.first if np.size(operand) > 1 else 0]
-    return gathered_scalar(Array(operand.node, (), operand.first + operand.step * a.first))
 
 
 def _node_of(value: Value) -> Node | None:
