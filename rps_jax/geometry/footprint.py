@@ -97,7 +97,7 @@ def signed_distance(footprint: Footprint, point: Float[Array, "*P 2"]) -> Float[
     for i in range(footprint.vertices.shape[0]):
         x, y = point[..., 0] - start[i, 0], point[..., 1] - start[i, 1]
         ahead = along[i] / length2[i]
-        # At the nearest point of an edge, the distance does not change with t.
+        # The first derivative of the distance by t is zero at the nearest point of an edge.
         t = jax.lax.stop_gradient(jnp.clip(x * ahead[0] + y * ahead[1], 0.0, 1.0))
         away_x, away_y = x - t * along[i, 0], y - t * along[i, 1]
         square = away_x * away_x + away_y * away_y
