@@ -99,12 +99,12 @@ distance.to_series().unstack("law").round(3)
 # <!-- table: reading_evidence -->
 # | omega from the saturated v_x | v_x and v_y clipped one by one | hardware | Table II and targets | Fig. 6 | all |
 # | --- | --- | --- | --- | --- | --- |
-# | no | no | 1 ± 0 % | 4 ± 1 % | 30 ± 5 % | 0 ± 0 % |
-# | no | yes | 1 ± 1 % | 18 ± 3 % | 24 ± 6 % | 1 ± 0 % |
-# | yes | no | 95 ± 1 % | 35 ± 4 % | 27 ± 3 % | 96 ± 2 % |
-# | yes | yes | 3 ± 1 % | 43 ± 4 % | 19 ± 3 % | 3 ± 2 % |
+# | no | no | 1 ± 0 % | 9 ± 5 % | 31 ± 4 % | 0 ± 0 % |
+# | no | yes | 1 ± 1 % | 18 ± 4 % | 23 ± 6 % | 1 ± 0 % |
+# | yes | no | 95 ± 1 % | 30 ± 4 % | 26 ± 3 % | 97 ± 1 % |
+# | yes | yes | 3 ± 1 % | 43 ± 5 % | 19 ± 3 % | 2 ± 1 % |
 #
-# <sub>Computed before the hardware's experiments got the closet. Device: one NVIDIA H200 and 16 processors; date: 2026-11-26; [command, versions and values](../sweeps/paper_reading/results/reading_evidence.json).</sub>
+# <sub>Device: one NVIDIA H200, shared with other programs; date: 2026-11-29; [command, versions and values](../sweeps/paper_reading/results/reading_evidence.json).</sub>
 # <!-- end -->
 #
 # The numbers of the hardware decide: $\omega$ follows from the saturated $v_x$, and $(v_x, v_y)$ is
@@ -113,8 +113,8 @@ distance.to_series().unstack("law").round(3)
 # The page of `rps sweeps/paper_reading` has all numbers under the posterior, and as predicted from
 # all other numbers. The box's D on the hardware can be reproduced
 # (<!-- cell: reading_numbers | hardware, box: D | paper -->0.032 m<!-- end --> in the paper, <!-- cell: reading_numbers | hardware, box: D | posterior -->0.033<!-- end --> m under the posterior), but
-# the other numbers do not predict it (<!-- cell: reading_numbers | hardware, box: D | predicted from the others -->0.060<!-- end --> m). With the
-# box on its corners, draws with a small D lose a share of <!-- cell: reading_posterior | hardware | share of omega that is lost | posterior: median, 5 to 95 % -->0.42<!-- end --> (median) of the yaw rate. This does not follow
+# the other numbers do not predict it (<!-- cell: reading_numbers | hardware, box: D | predicted from the others -->0.067<!-- end --> m). With the
+# box on its corners, draws with a small D lose a share of <!-- cell: reading_posterior | hardware | share of omega that is lost | posterior: median, 5 to 95 % -->0.41<!-- end --> (median) of the yaw rate. This does not follow
 # from the paper: slips, friction and pressure under the box are fitted together, and the pressure stays unknown
 # (even <!-- cell: support_posterior | pressure under the box | even | posterior -->30%<!-- end -->, rim <!-- cell: support_posterior | pressure under the box | rim | posterior -->35%<!-- end -->, corners <!-- cell: support_posterior | pressure under the box | corners | posterior -->35%<!-- end --> of the posterior of `sweeps/ground/support.py`).
 #
@@ -129,13 +129,13 @@ distance.to_series().unstack("law").round(3)
 # <!-- table: reading_figure_6 -->
 # | the paper's text | in the closest draw | posterior probability |
 # | --- | --- | --- |
-# | the sensor initially detected only the right corner, 0.2 m from the center | yes | 72 ± 7 % |
+# | the sensor initially detected only the right corner, 0.2 m from the center | yes | 75 ± 3 % |
 # | a_r started from nearly at its highest value | yes | 98 ± 0 % |
-# | a line contact occurred with the side edge of the box | yes | 98 ± 1 % |
-# | the Realignment State ... remained active until ... the center of the robot | yes | 55 ± 6 % |
+# | a line contact occurred with the side edge of the box | yes | 96 ± 1 % |
+# | the Realignment State ... remained active until ... the center of the robot | yes | 45 ± 4 % |
 # | the robot successfully pushed the object to the target | yes | 100 ± 0 % |
 #
-# <sub>Computed before the hardware's experiments got the closet. Device: one NVIDIA H200 and 16 processors; date: 2026-11-26; [command, versions and values](../sweeps/paper_reading/results/reading_figure_6.json).</sub>
+# <sub>Device: one NVIDIA H200, shared with other programs; date: 2026-11-29; [command, versions and values](../sweeps/paper_reading/results/reading_figure_6.json).</sub>
 # <!-- end -->
 #
 # ![Fig. 6 in this draw](../sweeps/paper_reading/figure_6.png)
