@@ -218,7 +218,7 @@ def scan(
 ) -> tuple[Pytree, Pytree]:
     """Return `jax.lax.scan` of a batch of worlds (B, ...) by one native function for all steps.
 
-    So are its derivatives.
+    Its derivatives in each mode are one native function, too.
 
     Args:
       step: of one world, from state, constants and the residuals of `batched`. It returns state
@@ -275,12 +275,14 @@ def scan(
 
             return jax.lax.scan(pull_row, start, (saved[:scanned], rows), reverse=True)[0]
 
+        def forward(saved: Sequence[Array], vectors: Sequence[Array]) -> list[Array]:
+            return _computed(push_all, (saved, vectors))
+
         def transpose(saved: Sequence[Array], vectors: Sequence[Array]) -> list[Array]:
             start = [*vectors[:count], *(jnp.zeros_like(saved[i]) for i in fixed)]
             return _computed(pull_all, (saved, start, vectors[count:]))
 
-        maps = lambda *inputs: _computed(push_all, inputs), transpose
-        return (end, outputs), _tangents(*maps, saved, vectors, (end, outputs))
+        return (end, outputs), _tangents(forward, transpose, saved, vectors, (end, outputs))
 
     call.defjvp(rule, symbolic_zeros=True)
     end, outputs = call(*jax.tree.map(jnp.asarray, (state, constants)))
@@ -497,7 +499,7 @@ def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
       TooLargeError: a kernel needs too much shared memory.
     """
     fewest, most = _THREADS
-    if Rows.of(functions[0].trace.jaxpr).length > 1:
+    if Rows.from_jaxpr(functions[0].trace.jaxpr).length > 1:
         fewest *= 2  # gradients are of too few worlds to fill a GPU
     with contextlib.suppress(TooLargeError):
         return fewest, _printed(functions, GpuWriter, fewest)

@@ -281,7 +281,7 @@ class Rows(NamedTuple):
     reverse: bool = False
 
     @classmethod
-    def of(cls, closed: ClosedJaxpr) -> Rows:
+    def from_jaxpr(cls, closed: ClosedJaxpr) -> Rows:
         """Return the step of a function that is one scan of its arguments, else the function."""
         jaxpr, eqn = closed.jaxpr, closed.jaxpr.eqns[0] if len(closed.jaxpr.eqns) == 1 else None
         if eqn is None or eqn.primitive.name != "scan" or eqn.outvars != jaxpr.outvars:

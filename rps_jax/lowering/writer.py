@@ -407,7 +407,7 @@ class SimdWriter(Writer):
           UnsupportedError: it has an operation that is not in the headers.
           TooLargeError: a kernel needs too much shared memory.
         """
-        self.rows = rows = Rows.of(closed)
+        self.rows = rows = Rows.from_jaxpr(closed)
         returned, roots = results(rows, shapes, outs, self.builder())
         nodes, (sized, size) = live_nodes(roots), first_array(shapes)
         self.assign_storage(nodes, returned)

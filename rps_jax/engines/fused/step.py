@@ -176,7 +176,7 @@ class FusedStage(NamedTuple):
         inputs = fields, motion, period.twists, period.robot
         if motion.qpos.ndim != 2:
             return steps(*inputs, period.solutions)
-        return native.batched(with_solutions, steps, True)(*inputs)
+        return native.batched(with_solutions, steps, has_residuals=True)(*inputs)
 
 
 def _drive(
