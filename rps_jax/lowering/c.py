@@ -34,12 +34,16 @@ class CWriter(ScalarWriter):
 
     spelling = spelled("c")
     flag = "({} != 0)"  # C takes any number but 0 for true
-    alias = "{head} = &{corner};"
+    alias = "const {head} = &{corner};"
     pointer = "*"
     zeros = "{{0}}"
 
     def type_of(self, kind: str) -> str:
         return type_of(kind, self.prefix)
+
+    def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
+        # Clang expands each constant in the initialisers of others, in exponential time.
+        return super().declaration(kind, name, size, constant=False)
 
     def literal(self, value: float, kind: str) -> str:
         return literal(self.prefix, value, kind)
@@ -61,7 +65,7 @@ class CWriter(ScalarWriter):
             return f"{short!s}f" if exact else self.literal(value.item(), kind)
 
         sized = sized_name(name, array.shape)
-        return f"static {self.declaration(kind, sized)} = {text(array)};"
+        return f"static const {self.declaration(kind, sized)} = {text(array)};"
 
 
 def type_of(kind: str, prefix: str) -> str:

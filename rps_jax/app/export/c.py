@@ -41,7 +41,7 @@ def _for_each(fields: Sequence[Field], prefix: str, statement: str, kinds: str =
 
 def _stack(text: str) -> int:
     """Return the size [B] of the local variables in statements, in float."""
-    sizes = re.findall(r"^ +(?:const )?\w+ \w+(?:\[(\d+)\])?(?: =|;)", text, re.MULTILINE)
+    sizes = re.findall(r"^ +\w+ \w+(?:\[(\d+)\])?(?: =|;)", text, re.MULTILINE)
     return 4 * sum(int(size or 1) for size in sizes)
 
 
