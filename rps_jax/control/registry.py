@@ -134,7 +134,8 @@ def check_task(params: LawParams, task: str, room: float, follows: bool) -> None
         rule += "heading=... for the path's end"
     elif law.room > room:
         rule = f"its detours need {law.room:g} m without walls around the object, not {room:g} m; "
-        rule += "choose a wider one, or another law"
+        rule += "choose another law, a corridor of a greater width=... (twice that), or rooms of a "
+        rule += "greater base_radius=... and object_radius=..."
     if rule:
         raise errors.not_allowed("task", f"{task} with the law {_name_of(params)}", rule)
 
