@@ -145,9 +145,9 @@ print(f"median error {np.median(error):.4f}, in {np.sum(error < 2 * precision**-
 # [The race](../sweeps/gradients/README.md) compares it with these slopes alone and with evolution.
 # Success in held-out worlds after equal simulated time, by number of tuned parameters and method:
 #
-# - 2,048, after 100,000 s: derivatives <!-- cell: gradients_race | 2048 | 100,000 s | derivatives | success -->83.5 %<!-- end -->
+# - 2,048, after 100,000 s: derivatives <!-- cell: gradients_race | 2048 | 100,000 s | derivatives | success -->83.9 %<!-- end -->
 # - slopes <!-- cell: gradients_race | 2048 | 100,000 s | slopes | success -->70.9 %<!-- end -->
 # - evolution <!-- cell: gradients_race | 2048 | 100,000 s | evolution | success -->70.9 %<!-- end -->
-# - 64, after 300,000 s: derivatives <!-- cell: gradients_race | 64 | 300,000 s | derivatives | success -->85.0 %<!-- end -->
+# - 64, after 300,000 s: derivatives <!-- cell: gradients_race | 64 | 300,000 s | derivatives | success -->85.4 %<!-- end -->
 # - slopes <!-- cell: gradients_race | 64 | 300,000 s | slopes | success -->85.9 %<!-- end -->
 # - evolution <!-- cell: gradients_race | 64 | 300,000 s | evolution | success -->83.1 %<!-- end -->

@@ -50,10 +50,6 @@ STALE: dict[str, str] = {
     "export_paper": "exported code tests the bits of numbers for NaN",
     "pose_paths": "the law `pose` got another sense of even contact",
     "fit_one_push": "a sum in the solver got its former order back, with other last bits",
-    **dict.fromkeys(
-        ("gradients_race", "gradients_race_18"),
-        "one native function ran all steps of a gradient, with other last bits",
-    ),
 }
 NUMBERS = SWEEPS / "publish" / "numbers.json"
 _NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
