@@ -172,7 +172,7 @@ def same(record: Record, today: Record) -> bool:
         digests = {row[0] for row in current.values()}
         return all(row[0] in digests for row in recorded.values())
     return recorded.keys() <= current.keys() and all(
-        abs(a - b) <= TOLERANCE * max(size, 1e-9)
+        abs(a - b) <= TOLERANCE * max(size, 1e-6)
         for name, (_, *row, size) in recorded.items()
         for a, b in zip((*row, size), current[name][1:], strict=True)
     )
@@ -247,14 +247,18 @@ def _folder() -> tempfile.TemporaryDirectory[str]:
 
 
 def _processor() -> str:
-    """Return the model of the processor, or of the GPU that JAX uses."""
+    """Return the model of the processor with the numbers of its family and model, or of the GPU."""
     import jax
 
     if (used_device := jax.devices()[0]).platform != "cpu":
         return used_device.device_kind
     info = Path("/proc/cpuinfo")
-    match = re.search(r"model name\s*: (.*)", info.read_text()) if info.exists() else None
-    return match[1] if match else platform.machine()
+    text = info.read_text() if info.exists() else ""
+    fields = dict(re.findall(r"^(cpu family|model|model name)\s*: (.*)", text, re.MULTILINE))
+    if len(fields) < 3:  # as on ARM
+        return platform.machine()
+    # A name alone may stand for several processors, whose last bits differ.
+    return "{model name} (family {cpu family}, model {model})".format_map(fields)
 
 
 def _variables(out: Path) -> Iterable[tuple[str, list[Any]]]:
