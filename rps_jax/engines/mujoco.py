@@ -82,10 +82,6 @@ class Batch:
         # A diverged world is an outcome; MuJoCo would write its warnings to a file.
         mujoco.set_mju_user_warning(lambda _: None)
 
-    def set_positions(self, rows: np.ndarray, qpos: np.ndarray) -> None:
-        """Set the positions (n, 10) of the worlds `rows` (n,)."""
-        self.qpos[rows] = qpos
-
     @property
     def driven(self) -> Driven:
         """Motion and force of all worlds."""

@@ -127,13 +127,16 @@ def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tupl
     turn = jnp.cos(base[2]), jnp.sin(base[2])
     p = sp.turned_back(turn, (pushed[0] - base[0], pushed[1] - base[1]))
     v_x, v_y, omega = twist
-    reach = sp.dot(slider.base_size, slider.base_size)
+    reach, yaw = sp.dot(slider.base_size, slider.base_size), pushed[2] - base[2]
+    pads = slider.pads
+    if pads is not None:
+        pads = *sp.turned((jnp.cos(yaw), jnp.sin(yaw)), pads), *pads[2:]
     problem = Problem(
-        _contacts(slider, (*p, pushed[2] - base[2]), twist),
+        _contacts(slider, (*p, yaw), twist),
         jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _MIN_SPEED**2),
         slider.arm,
         slider.friction_robot,
-        None if slider.pads is None else _turned(slider.pads, pushed[2] - base[2]),
+        pads,
     )
     v = solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
 
@@ -191,11 +194,6 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
             for h, (i, j) in zip(hessian, ENTRIES, strict=True)
         ]
     return gradient, hessian
-
-
-def _turned(pads: tuple[Number, ...], yaw: Number) -> tuple[Number, ...]:
-    """Return the rows of pads turned by an angle [rad]."""
-    return *sp.turned((jnp.cos(yaw), jnp.sin(yaw)), pads), *pads[2:]
 
 
 def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:

@@ -78,7 +78,7 @@ def observe_pose(
     if not poses.shape[0]:
         return poses, pose
     poses = jnp.concatenate([pose[None], poses[:-1]])
-    delayed = poses[_steps_of(odometry.pose_latency, period)]
+    delayed = poses[steps_of(odometry.pose_latency, period)]
     noise = jax.random.fold_in(jax.random.fold_in(key, _ODOMETRY), steps)
     sigma = jnp.stack([odometry.pose_noise] * 2 + [odometry.yaw_noise])
     return poses, delayed + sigma * normal(noise, (3,), pose.dtype)
@@ -89,14 +89,8 @@ def normal(key: Array, shape: tuple[int, ...], dtype: DTypeLike) -> Array:
     return jax.random.normal(key, shape, jnp.float32).astype(dtype)
 
 
-def delay_twist(odometry: Odometry, twists: Array, twist: Array, period: float) -> Pair:
-    """Return the latest commanded twists (K, 3), `twist` (3,) first, and the delayed one (3,)."""
-    twists = jnp.concatenate([twist[None], twists[:-1]])
-    delayed = twists[_steps_of(odometry.command_delay, period)]
-    return twists, delayed
-
-
-def _steps_of(time: Number, period: float) -> Array:
+def steps_of(time: Number, period: float) -> Array:
+    """Return the number of control steps of `period` [s] in a time [s]."""
     return jnp.round(time / period).astype(jnp.int32)
 
 

@@ -359,7 +359,8 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     Both twists are in the robot frame; `period` [s] is the control period.
     """
     if trial.twists.shape[0]:
-        twists, delayed = base.delay_twist(world.odometry, trial.twists, jnp.stack(twist), period)
+        twists = jnp.concatenate([jnp.stack(twist)[None], trial.twists[:-1]])
+        delayed = twists[base.steps_of(world.odometry.command_delay, period)]
         delayed = base.apply_errors(world.robot, delayed, world.odometry.velocity_error)
         trial, twist = trial._replace(twists=twists), Twist(*delayed)
     if world.robot is None or trial.drive is None:
@@ -744,7 +745,7 @@ def run_on_host(
             qpos, running = np.asarray(decided.qpos), np.flatnonzero(~np.asarray(decided.done))
             # Only a scripted shift moves the object outside of the engine.
             moved = np.flatnonzero(np.any(qpos != np.asarray(trials.qpos), axis=1))
-            batch.set_positions(moved, qpos[moved])
+            batch.qpos[moved] = qpos[moved]
             if running.size:
                 twists = np.stack(twist, axis=1)[running].astype(float)
                 batch.drive(running, twists, loop.physics.substeps)

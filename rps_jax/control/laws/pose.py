@@ -72,7 +72,7 @@ from rps_jax.control.base import (
     SuccessDistance,
     bounds_of,
 )
-from rps_jax.control.box import FLUSH, Box, extents, feel, turned, unknown_box
+from rps_jax.control.box import FLUSH, Box, extents, feel, turned
 from rps_jax.control.laws.unicycle import MODES, contact_of, turn_around
 from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
 from rps_jax.geometry import planar, solid
@@ -288,7 +288,8 @@ def step(
     # Where the end of the front is dead, only the side feels the object.
     forgets = (first | (pushing & touches & ~on_front)) & ~jnp.any(state.known)
     forgets |= is_uneven & (obs.ends[0] - obs.ends[1] < _NARROW)
-    square = unknown_box(grid @ (middle - goal) + params.r)
+    no = jnp.zeros(4, bool)
+    square = Box(grid @ (middle - goal) + params.r, no, no[:2])
     h, known, centred = soft.tree_where(forgets, square, soft.tree_where(feels, felt, box))
 
     h = jnp.where(touches & ~known, jnp.maximum(h, grid @ (p_world_contact - goal)), h)

@@ -229,11 +229,6 @@ def _either(*conditions: Array) -> Array:
     return reduce(lambda a, b: a | b if a.dtype == b.dtype == bool else a + b, conditions)
 
 
-def _is(condition: Array) -> Array:
-    """Return a condition as a bool."""
-    return condition if condition.dtype == bool else condition > 0.5
-
-
 def step(
     params: UnicycleParams,
     state: UnicycleState,
@@ -290,7 +285,8 @@ def step(
     is_finished = and_(and_(push, touched), or_(or_(and_(touches, spent), is_lost), missed))
 
     # D6: the side is chosen before the base leaves, and kept on the way.
-    offset, chooses = p_world_axle - middle, _is(or_(push, state.retreat))
+    offset, chooses = p_world_axle - middle, or_(push, state.retreat)
+    chooses = chooses if chooses.dtype == bool else chooses > 0.5
     radii = params.R + axle, params.R_s + axle
     circle = middle, psi, offset, state.side, chooses, *radii, params.carrot
     side, is_direct, staging, aim = way_around(*circle, angle)
