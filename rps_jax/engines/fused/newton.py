@@ -161,7 +161,11 @@ class Problem(NamedTuple):
         free = sp.to_world(m, (torque[0] / i[0], torque[1] / i[1], torque[2] / i[2]))
         start = state.accelerations
         lift = (0.0, 0.0, GRAVITY) if body.gravity is None else sp.scale(-1, body.gravity)
-        return cls(body.mass, _spin(body, m), free, contacts, base, start, lift)
+        spin: Any = [
+            tuple(sum(m[r][k] * m[c][k] * i[k] for k in range(3)) for c in range(3))
+            for r in range(3)
+        ]
+        return cls(body.mass, spin, free, contacts, base, start, lift)
 
     def gauss(self, x: Sequence[Vec]) -> list[Vec]:
         """Return M (x - free accelerations)."""
@@ -332,14 +336,6 @@ def _sums(vector: Vec) -> Vec:
 def _any(active: Array) -> Array:
     """Whether any entry is above zero."""
     return jnp.sum(active) > 0
-
-
-def _spin(body: Body, m: Sequence[Vec]) -> list[Vec]:
-    """Return the inertia tensor in the world's axes."""
-    i = body.inertia
-    return [
-        tuple(sum(m[r][k] * m[c][k] * i[k] for k in range(3)) for c in range(3)) for r in range(3)
-    ]  # type: ignore[return-value]
 
 
 def _stiffen(h: list[list[Number]], c: Contact, k: Row) -> None:
