@@ -431,7 +431,7 @@ class _Program:
         return jax.tree.map(shape, self.queues[index].shapes)
 
 
-_Advance = Callable[..., tuple[tuple[Trial, ...], tuple[SegmentState, ...]]]
+_Advance = Callable[..., trial.Advanced]
 _Ended = tuple[np.ndarray, Outcome, float]  # indices of trials, outcomes, and [s] that all advanced
 
 

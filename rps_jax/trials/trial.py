@@ -655,9 +655,10 @@ class SegmentState(NamedTuple):
     outcome: Outcome  # (B, ...)
 
 
-def segment_of(
-    physics: Physics, law: Law
-) -> Callable[..., tuple[tuple[Trial, ...], tuple[SegmentState, ...]]]:
+Advanced = tuple[tuple[Trial, ...], tuple[SegmentState, ...]]  # after a segment, by batch
+
+
+def segment_of(physics: Physics, law: Law) -> Callable[..., Advanced]:
     """Return a function that starts fresh trials of batches, and runs some control steps of all.
 
     Its arguments are stages, inputs and trials of the batches; masks (B,) of the trials that start
@@ -673,7 +674,7 @@ def segment_of(
         live: tuple[Array, ...],
         rules: Rules,
         steps: Array,
-    ) -> tuple[tuple[Trial, ...], tuple[SegmentState, ...]]:
+    ) -> Advanced:
         pairs = zip(inputs, live, strict=True)
         started = [start_all(*leaves, mask, law=law) for leaves, mask in pairs]
         current = tuple(map(jax.vmap(soft.tree_where), fresh, started, trials))

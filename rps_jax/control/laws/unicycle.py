@@ -50,7 +50,16 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import ApproachSpeed, Law, Memory, OmegaMax, SuccessDistance, bounds_of
+from rps_jax.control.base import (
+    ApproachSpeed,
+    Law,
+    Memory,
+    OmegaMax,
+    SuccessDistance,
+    TimeLost,
+    Touched,
+    bounds_of,
+)
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Number, Parameter
@@ -132,8 +141,8 @@ class UnicycleState(NamedTuple):
     p_world_object: Annotated[Array, Spec("m", "M, middle of the object")]  # (2,)
     p_world_contact: Annotated[Array, Spec("m", "C, the last contact")]  # (2,)
     l: Annotated[Array, Spec("m", "contact offset at C")]  # noqa: E741
-    touched: Annotated[Array, Spec("1", "whether there was a contact")]
-    t_lost: Annotated[Array, Spec("s", "time since the last contact")]
+    touched: Touched
+    t_lost: TimeLost
     pushed: Annotated[Array, Spec("1", "whether this push had a contact; 0 in an approach")]
     side: Annotated[Array, Spec("1", "1: counter-clockwise around M; -1: clockwise")]
     misses: Annotated[Array, Spec("1", "approaches since the last contact that missed")]
