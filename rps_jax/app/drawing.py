@@ -150,16 +150,14 @@ class Drawing:
         self._remembered.visible = not math.isnan(x)
         if self._remembered.visible:
             self._remembered.position = (x, y, rendering.PIN[1])
-        self._show_twist(*map(float, moment.snapshot.twist))
-        way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
-        self._base_path.points = _joined([m.snapshot.qpos[:2] for m in way], 0.006)
-        self._contact_path.points = _joined([m.p_world_contact for m in way], 0.012)
-
-    def _show_twist(self, v_x: float, v_y: float, omega: float) -> None:
-        """Show the velocities of the left and the right side of the base by arrows."""
+        # Velocities of the left and the right side of the base.
+        v_x, v_y, omega = map(float, moment.snapshot.twist)
         velocities = np.array([[v_x - omega * y, v_y + omega * x, 0.0] for x, y, _ in _SHOULDERS])
         self._velocity.points = np.stack([_SHOULDERS, _SHOULDERS + _ARROW * velocities], axis=1)
         self._velocity.visible = bool(np.abs(velocities).max() > 1e-3)
+        way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
+        self._base_path.points = _joined([m.snapshot.qpos[:2] for m in way], 0.006)
+        self._contact_path.points = _joined([m.p_world_contact for m in way], 0.012)
 
 
 def _joined(points: Sequence[ArrayLike], height: float) -> np.ndarray:

@@ -144,7 +144,7 @@ def init_load(template: Array) -> Load:
 # --- the drive -----------------------------------------------------------------------------
 
 STALLED = 0.1  # [1] share of the executed speed below which a base stands still
-_STALL = 1.0  # [s] of standing still after which a base has stalled
+STALL = 1.0  # [s] of standing still after which a base has stalled
 _MOVING = 1e-3  # [m/s] executed speed above which a base can stall
 GRIP = 1e3  # [1] mass of a base sideways, over its own mass
 
@@ -334,8 +334,3 @@ def count_stalled_steps(robot: Robot, drive: Drive, qvel: Array) -> Drive:
     speed = planar.norm(apply_slip(robot, drive.aim)[:2])
     stands = (planar.norm(qvel[:2]) < STALLED * speed) & (speed > _MOVING)
     return drive._replace(stalled=jnp.where(stands, drive.stalled + 1, 0))
-
-
-def has_stalled(drive: Drive | None, period: float) -> Array | bool:
-    """Whether () a base has stood still for `_STALL`; `period` [s] is the control period."""
-    return False if drive is None else drive.stalled * period >= _STALL

@@ -565,6 +565,7 @@ def outcome(trial: Trial, worlds: World, loop: ControlLoop) -> Outcome:
     is_lost = (trial.contact_steps == 0) | (trial.lost_steps * period > loop.rules.max_lost)
     position, yaw = jax.vmap(object_pose)(trial.qpos.reshape(-1, 10))
     pose = jnp.concatenate([position, yaw[:, None]], axis=-1)
+    stalled = False if trial.drive is None else trial.drive.stalled * period >= base.STALL
     return Outcome(
         success=trial.success,
         time=trial.steps * period,
@@ -580,7 +581,7 @@ def outcome(trial: Trial, worlds: World, loop: ControlLoop) -> Outcome:
         tipped=trial.tipped,
         diverged=trial.diverged,
         nan_twist=trial.nan_twist,
-        stalled=base.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
+        stalled=stalled & ~trial.success & ~trial.diverged,
         unfelt=trial.done & is_lost & jax.vmap(is_pressed)(worlds, trial.qpos),
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),

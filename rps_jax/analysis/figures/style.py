@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from matplotlib import cycler, figure, patches, rc_context, transforms
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable as ScalarMappable
@@ -111,12 +110,6 @@ def base_patch(
     corners = corners * np.asarray(sizes)
     world = solid.rotate(pose[2], corners) + pose[:2]
     return patches.Polygon(world, facecolor="0.35" if fill else "none", edgecolor="0.35")
-
-
-def base_sizes(trace: xr.Dataset) -> list[float]:
-    """Return the sizes of the base of a trial over time, for `base_patch`."""
-    names = ["base_radius"] if "base_radius" in trace else ["half_length", "half_width"]
-    return [float(trace[name]) for name in names]
 
 
 def shade(ax: Axes, time: np.ndarray, active: np.ndarray, colour: str) -> None:
