@@ -591,11 +591,11 @@ def outcome(trial: Trial, worlds: World, loop: ControlLoop) -> Outcome:
 
 @partial(jax.jit, static_argnames=("law",))
 def start_all(
-    worlds: World, params: LawParams, live: Bool[Array, " B"], law: Law = rps.LAW
+    worlds: World, params: LawParams, live: Bool[Array, " B"] | None = None, law: Law = rps.LAW
 ) -> Trial:
     """Return the trials of a batch of worlds before their start; those not `live` are padding."""
     trials = jax.vmap(partial(start, law=law))(worlds, params)
-    return trials._replace(done=~live)
+    return trials if live is None else trials._replace(done=~live)
 
 
 _UNCHECKED = 20  # control steps on a GPU before the host checks whether any trial runs
@@ -737,7 +737,7 @@ def run_on_host(
       Trials at the start and after each control step.
     """
     worlds, params = jax.device_put((worlds, params), jax.devices("cpu")[0])
-    trials = start_all(worlds, params, np.ones(len(worlds.qpos), bool), law=loop.law)
+    trials = start_all(worlds, params, law=loop.law)
     dtype, qpos = trials.qpos.dtype, np.asarray(trials.qpos, float)
     yield trials
     opened = engine.open_batch(stage, qpos, threads, pushing(worlds), worlds.fields)

@@ -63,7 +63,7 @@ def step(
     push = Twist.from_point_velocity(contact, v_contact, omega)
     push = push.saturate(params.v_max, params.omega_max)
     ahead = Twist(params.v_approach, 0.0, 0.0)
-    twist = jax.tree.map(lambda a, b: jnp.where(obs.in_contact, a, b), push, ahead)
+    twist = jax.tree.map(partial(jnp.where, obs.in_contact), push, ahead)
     details = Details.from_obs(obs._replace(p_robot_contact=contact))
     return state, twist, details._replace(gamma=error)
 

@@ -9,6 +9,7 @@ Reference: MuJoCo documentation, "Computation: Constraint model".
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -375,7 +376,7 @@ def polygon_and_base(
         for row, value in zip(sides[1:], score[1:], strict=True):
             better = value > top
             top = jnp.where(better, value, top)
-            picked = jax.tree.map(lambda new, old, w=better: jnp.where(w, new, old), row, picked)
+            picked = jax.tree.map(partial(jnp.where, better), row, picked)
         return picked
 
     of_base = side([s[0] for s in sides])

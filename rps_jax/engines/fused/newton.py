@@ -69,7 +69,7 @@ def contact_force(contact: Contact, x: Row, physics: Physics) -> tuple[Row, Row]
         stuck += [d_t, *(0.0 for _ in way[i + 1 :])]
     sticking = (-d * x[0], *(-d_t * y for y in x[1:])), tuple(stuck)
     sliding = force, tuple(stiffness)
-    return jax.tree.map(lambda a, b: jnp.where(sticks, a, b), sticking, sliding)
+    return jax.tree.map(partial(jnp.where, sticks), sticking, sliding)
 
 
 def _pyramid(contact: Contact, x: Row, physics: Physics) -> tuple[Row, Row]:
