@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.geometry import planar
+from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Array, Entries, Float, Pytree
 from rps_jax.geometry.friction import friction_of_pads, solved
 from rps_jax.geometry.polyline import is_inside
@@ -270,9 +271,8 @@ def _slide(pads: tuple, force: Array, flow: Array, stuck: Array) -> Array:
     def refine(carry: tuple) -> tuple:
         v: Entries = tuple(carry[0])
         gradient, hessian = friction_of_pads(fixed, v, _SMOOTH)
-        excess: Entries = tuple(g - f for g, f in zip(gradient, pull, strict=True))
-        change = solved(excess, hessian)
-        tried = [tuple(a - s * b for a, b in zip(v, change, strict=True)) for s in _LENGTHS]
+        change = solved(sp.sub(gradient, pull), hessian)
+        tried = [sp.sub(v, sp.scale(s, change)) for s in _LENGTHS]
         costs = jnp.stack([cost(x) for x in tried])
         best = jnp.argmin(costs)
         return (jnp.stack([jnp.stack(x) for x in tried])[best],)
@@ -282,6 +282,5 @@ def _slide(pads: tuple, force: Array, flow: Array, stuck: Array) -> Array:
     guess = jnp.where(cost(tuple(flow)) < cost(tuple(scaled)), flow, scaled)
     v = tuple(jax.lax.stop_gradient(_iterate(refine, (guess,))[0]))
     gradient, hessian = friction_of_pads(pads, v, _SMOOTH)
-    rest = (gradient[0] - force[0], gradient[1] - force[1], gradient[2])
-    change = solved(rest, jax.lax.stop_gradient(hessian))
-    return jnp.stack([a - b for a, b in zip(v, change, strict=True)])
+    rest = sp.sub(gradient, (force[0], force[1], 0.0))
+    return jnp.stack(sp.sub(v, solved(rest, jax.lax.stop_gradient(hessian))))

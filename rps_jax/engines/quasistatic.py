@@ -125,23 +125,22 @@ def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tupl
     """
     base, pushed = poses
     turn = jnp.cos(base[2]), jnp.sin(base[2])
-    p = sp.turned_back(turn, (pushed[0] - base[0], pushed[1] - base[1]))
+    p_x, p_y, yaw = sp.turned_back(turn, sp.sub(pushed, base))
     v_x, v_y, omega = twist
-    reach, yaw = sp.dot(slider.base_size, slider.base_size), pushed[2] - base[2]
-    pads = slider.pads
+    reach, pads = sp.dot(slider.base_size, slider.base_size), slider.pads
     if pads is not None:
-        pads = *sp.turned((jnp.cos(yaw), jnp.sin(yaw)), pads), *pads[2:]
+        pads = sp.turned((jnp.cos(yaw), jnp.sin(yaw)), pads)
     problem = Problem(
-        _contacts(slider, (*p, yaw), twist),
+        _contacts(slider, (p_x, p_y, yaw), twist),
         jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _MIN_SPEED**2),
         slider.arm,
         slider.friction_robot,
         pads,
     )
-    v = solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
+    v = solve(problem, (v_x - omega * p_y, v_y + omega * p_x, omega), dt)
 
     def moved(x: Vec, u: Vec) -> Vec:
-        return sp.add(x, sp.scale(dt, (*sp.turned(turn, u), u[2])))
+        return sp.add(x, sp.scale(dt, sp.turned(turn, u)))
 
     return moved(base, twist), moved(pushed, v)
 
@@ -172,7 +171,7 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
     stiff = 1 / problem.speed
     if problem.pads is None:
         inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
-        gradient: Vec = (inertia[0] * v[0], inertia[1] * v[1], inertia[2] * v[2])
+        gradient = sp.each(sp.mul, inertia, v)
         hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in ENTRIES]
     else:
         gradient, hessian = friction_of_pads(problem.pads, v, _LEAST_PACE * problem.speed)
@@ -207,11 +206,10 @@ def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
         normal, point, gap = circle_and_base((corners[0][0], corners[1][0]), radius, size)
         points, gaps = [point], [gap]
     else:
-        ahead = (jnp.roll(corners[0], -1, axis=0), jnp.roll(corners[1], -1, axis=0))
+        ahead = sp.each(lambda x: jnp.roll(x, -1, axis=0), corners)
         normal, middles, gaps = polygon_and_base(corners, ahead, size)
         gaps = [gap - radius for gap in gaps]
-        off = 0.5 * radius
-        points = [(q[0] - off * normal[0], q[1] - off * normal[1]) for q in middles]
+        points = [sp.sub(q, sp.scale(0.5 * radius, normal)) for q in middles]
     return [
         Contact(
             normal,

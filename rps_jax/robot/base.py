@@ -33,7 +33,7 @@ from jax.typing import DTypeLike
 from rps_jax import spec
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Number, Pair
-from rps_jax.geometry.vectors import Vec, turned
+from rps_jax.geometry.vectors import Point, Vec, sub, turned, turned_back
 from rps_jax.robot.robot import Robot
 from rps_jax.spec import Spec
 
@@ -248,7 +248,7 @@ def push(
     integral: Vec,  # [N, N, N m] of the servo, in the base's frame
     twist: Vec,  # [m/s, m/s, rad/s] aimed, in the base's frame
     velocity: Vec,  # [m/s, m/s, rad/s] of the base, in the world's frame
-    turn: tuple[Number, Number],  # cosine and sine of the base's heading
+    turn: Point,  # cosine and sine of the base's heading
     timestep: float,  # [s] of the physics
     xp: ModuleType = jnp,  # or numpy, for numbers on the host
 ) -> tuple[Vec, Vec]:
@@ -258,31 +258,27 @@ def push(
       Force and torque [N, N, N m] of the drive on the base, in the world's frame; and the integral
       after the step.
     """
-    c, s = turn
-    errors = (
-        twist[0] - (c * velocity[0] + s * velocity[1]),
-        twist[1] - (c * velocity[1] - s * velocity[0]),
-        twist[2] - velocity[2],
-    )
+    errors = sub(twist, turned_back(turn, velocity))
     inertia = (robot.mass, robot.mass, robot.inertia)
     if robot.drive != "omni":
         errors = _axle_errors(robot, twist, errors, xp)
         inertia = (robot.mass, robot.mass, robot.inertia + robot.mass * robot.axle_behind**2)
     rate = 2 * math.pi * robot.bandwidth  # [rad/s], critically damped
     demand = [m * 2 * rate * e + i for m, e, i in zip(inertia, errors, integral, strict=True)]
-    output = list(demand)
+    ahead, left, torque = demand
     if (limit := robot.push_max) is not None:
-        square = demand[0] * demand[0] + demand[1] * demand[1]
+        square = ahead * ahead + left * left
         size = xp.sqrt(xp.maximum(square, 1e-18))  # the square root of 0 has no derivative
         share = xp.minimum(1.0, limit / size)
-        output[:2] = demand[0] * share, demand[1] * share
+        ahead, left = ahead * share, left * share
     if (limit := robot.turn_max) is not None:
-        output[2] = xp.minimum(xp.maximum(demand[2], -limit), limit)
+        torque = xp.minimum(xp.maximum(torque, -limit), limit)
+    output = ahead, left, torque
     x, y, z = (
         i + timestep * (m * rate**2 * e + rate * (u - d))  # anti-windup: u - d is the cut-off part
         for i, m, e, u, d in zip(integral, inertia, errors, output, demand, strict=True)
     )
-    return (*turned(turn, output), output[2]), (x, y, z)
+    return turned(turn, output), (x, y, z)
 
 
 def _axle_errors(robot: Robot, twist: Vec, errors: Vec, xp: ModuleType) -> Vec:
@@ -305,7 +301,7 @@ class Tyres(NamedTuple):
     rest: Number  # () [m/s^2] that leaves no sideways velocity after the step
 
     @classmethod
-    def of(cls, robot: Robot, velocity: Vec, turn: tuple[Number, Number], dt: float) -> Tyres:
+    def of(cls, robot: Robot, velocity: Vec, turn: Point, dt: float) -> Tyres:
         """Return the tyres of a base with a `velocity` in the world, for a step of `dt` [s].
 
         `turn` has the cosine and sine of the heading at the start of the step.
