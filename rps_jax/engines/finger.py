@@ -220,7 +220,7 @@ def _iterate(refine: Callable[[tuple], tuple], start: tuple) -> tuple:
 def _power(pads: tuple, v: Vec) -> Array:
     """Return the power of friction at a twist."""
     x, y, share, radius = pads
-    u, w = v[0] - v[2] * y, v[1] + v[2] * x
+    u, w = sp.at_point(v, (x, y))
     return share @ jnp.sqrt(u * u + w * w + (v[2] * radius) ** 2 + _SMOOTH**2)
 
 

@@ -124,20 +124,20 @@ def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tupl
     A pose is x, y [m], yaw [rad] in the world, for the object of its centre of mass.
     """
     base, pushed = poses
-    turn = jnp.cos(base[2]), jnp.sin(base[2])
-    p_x, p_y, yaw = sp.turned_back(turn, sp.sub(pushed, base))
+    turn = sp.turn(base[2])
+    *p, yaw = sp.turned_back(turn, sp.sub(pushed, base))
     v_x, v_y, omega = twist
     reach, pads = sp.dot(slider.base_size, slider.base_size), slider.pads
     if pads is not None:
-        pads = sp.turned((jnp.cos(yaw), jnp.sin(yaw)), pads)
+        pads = sp.turned(sp.turn(yaw), pads)
     problem = Problem(
-        _contacts(slider, (p_x, p_y, yaw), twist),
+        _contacts(slider, (p[0], p[1], yaw), twist),
         jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _MIN_SPEED**2),
         slider.arm,
         slider.friction_robot,
         pads,
     )
-    v = solve(problem, (v_x - omega * p_y, v_y + omega * p_x, omega), dt)
+    v = solve(problem, (*sp.at_point(twist, p), omega), dt)
 
     def moved(x: Vec, u: Vec) -> Vec:
         return sp.add(x, sp.scale(dt, sp.turned(turn, u)))
@@ -179,13 +179,13 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
     for contact in problem.contacts:
         n, r = contact.normal, contact.r
         t = (-n[1], n[0])
-        u = (v[0] - v[2] * r[1] - contact.v[0], v[1] + v[2] * r[0] - contact.v[1])
+        u = sp.sub(sp.at_point(v, r), contact.v)
         v_t = sp.dot(t, u)
         slide = jnp.sqrt(v_t * v_t + tiny * tiny)  # a smooth |v_t|
         inside = -contact.gap - dt * (sp.dot(n, u) - friction * (slide - tiny))
         force, stiffness = _spring(inside)
-        along = _with_moment(t, r)
-        push = sp.sub(_with_moment(n, r), sp.scale(friction * v_t / slide, along))
+        along = sp.wrench(r, t)
+        push = sp.sub(sp.wrench(r, n), sp.scale(friction * v_t / slide, along))
         gradient = sp.sub(gradient, sp.scale(force, push))
         bend = force * friction * tiny * tiny / (slide * slide * slide)
         hessian = [
@@ -213,17 +213,12 @@ def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
     return [
         Contact(
             normal,
-            (q[0] - p_x, q[1] - p_y),
-            (twist[0] - twist[2] * q[1], twist[1] + twist[2] * q[0]),
+            sp.sub(q, pose[:2]),
+            sp.at_point(twist, q),
             gap,
         )
         for q, gap in zip(points, gaps, strict=True)
     ]
-
-
-def _with_moment(direction: Point, r: Point) -> Vec:
-    """Return a unit force at r with its moment."""
-    return (*direction, r[0] * direction[1] - r[1] * direction[0])
 
 
 def _spring(inside: Number) -> tuple[Number, Number]:

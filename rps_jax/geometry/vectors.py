@@ -86,18 +86,33 @@ def norm(a: Sequence[Number], least: float = 1e-12) -> Number:
     return jnp.sqrt(jnp.maximum(dot(a, a), least * least))
 
 
-def turned(turn: Point, a: V) -> V:
+def turned(by: Point, a: V) -> V:
     """Rotate x and y of a vector by an angle, given by its cosine and sine."""
-    (c, s), (x, y, *rest) = turn, a
+    (c, s), (x, y, *rest) = by, a
     entries: Any = c * x - s * y, s * x + c * y, *rest
     return entries
 
 
-def turned_back(turn: Point, a: V) -> V:
+def turned_back(by: Point, a: V) -> V:
     """Rotate x and y of a vector by minus an angle, given by its cosine and sine."""
-    (c, s), (x, y, *rest) = turn, a
+    (c, s), (x, y, *rest) = by, a
     entries: Any = c * x + s * y, c * y - s * x, *rest
     return entries
+
+
+def turn(yaw: Number) -> Point:
+    """Return the cosine and sine of an angle [rad]."""
+    return jnp.cos(yaw), jnp.sin(yaw)
+
+
+def at_point(twist: Sequence[Number], arm: Sequence[Number]) -> Point:
+    """Return the planar velocity of the point at an arm from the origin of a twist."""
+    return twist[0] - twist[2] * arm[1], twist[1] + twist[2] * arm[0]
+
+
+def wrench(arm: Point, force: Sequence[Number]) -> Vec:
+    """Return a force at an arm from the origin as x, y and torque about the origin."""
+    return force[0], force[1], minus(mul(arm[0], force[1]), mul(arm[1], force[0]))
 
 
 def to_world(m: Sequence[Vec], a: Vec) -> Vec:

@@ -158,8 +158,7 @@ def _resumed(start: Trial, fresh: Trial) -> Trial:
 
 def _check_scalars(params: LawParams) -> None:
     """Raise InputError for parameters that are no numbers, or arrays where the law has scalars."""
-    presets = (x for x in registry.LAWS.values() if type(x) is type(params))
-    known = named_leaves(next(presets, params))
+    known = named_leaves(registry.preset_of(params) or params)
     for name, leaf in named_leaves(params).items():
         if np.shape(leaf) and not np.shape(known.get(name, leaf)):
             rule = "give one number, and map over several by jax.vmap"

@@ -309,7 +309,7 @@ def _scatter(
     pose: np.ndarray, slope: np.ndarray, start: np.ndarray, covariance: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return the scatter (n,) of place [m] and turn [rad], of the model and the parameters."""
-    moved = np.linalg.norm(pose[:, :2] - start[:, :2], axis=1)
+    moved = _distance(pose, start)
     spread = np.einsum("nip,pq,niq->ni", slope, covariance, slope)
     # The scatter of the model grows with the motion of the object.
     size = {"place": moved, "turn": np.abs(pose[:, 2] - start[:, 2])}
@@ -320,10 +320,15 @@ def _scatter(
     }
 
 
+def _distance(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) [m] between poses (n, 3)."""
+    return np.linalg.norm(pose[:, :2] - other[:, :2], axis=1)
+
+
 def errors_of(pose: np.ndarray, end: np.ndarray) -> dict[str, np.ndarray]:
     """Return the errors (n,) of poses (n, 3): `place` [m] and `turn` [rad]."""
     turn = np.abs(solid.wrap(pose[:, 2] - end[:, 2]))
-    return {"place": np.linalg.norm(pose[:, :2] - end[:, :2], axis=1), "turn": turn}
+    return {"place": _distance(pose, end), "turn": turn}
 
 
 def _half_size(outline: np.ndarray) -> float:
@@ -344,7 +349,7 @@ def _check(corners: np.ndarray, data: Pushes, radius: float, prior: Mapping) -> 
         raise errors.not_allowed("pushes", f"push {i}", rule)
     turns = np.abs(data.end[:, 2] - data.start[:, 2])
     turns = np.where(turns < 2 * np.pi, np.abs(solid.wrap(turns)), turns) * _half_size(corners)
-    moved = np.linalg.norm(data.end[:, :2] - data.start[:, :2], axis=1)
+    moved = _distance(data.end, data.start)
     way = np.linalg.norm(np.diff(data.path, axis=1), axis=2).sum()
     for name, unit, motion in (("x and y", "m", moved), ("yaw", "rad", turns)):
         if (ratio := np.nansum(motion) / max(way, 1e-9)) > _CARRIED:
@@ -449,7 +454,7 @@ class FitObject(Question[ObjectFit]):
         pads = finger.uniform_pads(corners) if self.feet is None else _pads_of(self.feet)
         fixed, size = _fixed(corners, pads, self.radius), _half_size(corners)
         turn = size * solid.wrap(data.end[:, 2] - data.start[:, 2])
-        way = np.linalg.norm(data.end[:, :2] - data.start[:, :2], axis=1)
+        way = _distance(data.end, data.start)
         unit = _LOSS[0] + _LOSS[1] * np.nan_to_num(np.abs(np.stack([way, way, turn], axis=1)))
 
         def residuals(z: np.ndarray) -> np.ndarray:

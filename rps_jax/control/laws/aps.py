@@ -169,7 +169,7 @@ def step(
     correction = params.K1 * state.gamma_mean + params.K2 * state.gamma
     heading = heading - jnp.where(near, correction, 0.0) + a_OT - touch.yaw
 
-    yaw_error = planar.wrap(planar.direction(-from_object) - touch.yaw)
+    yaw_error = planar.bearing(-from_object, touch.yaw)
     rate = jnp.where(first, 0.0, planar.wrap(yaw_error - state.yaw_error) / touch.period)
     omega = params.K_p * yaw_error + params.K_d * rate
     speed = jnp.maximum(params.v_max / (1 + jnp.abs(state.gamma_mean)), params.v_min)

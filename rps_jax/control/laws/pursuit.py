@@ -56,7 +56,7 @@ def step(
     """
     contact = jnp.where(obs.in_contact, obs.p_robot_contact, 0.0)
     d = displacement(obs._replace(p_robot_contact=contact))
-    error = planar.wrap(planar.direction(d) - obs.yaw)
+    error = planar.bearing(d, obs.yaw)
     speed = jnp.minimum(params.K_v * planar.norm(d), params.v_max)
     v_contact = speed * jnp.stack([jnp.maximum(jnp.cos(error), params.press), jnp.sin(error)])
     omega = jnp.clip(params.K_h * error, -params.omega_max, params.omega_max)

@@ -111,7 +111,7 @@ def init(params: RPSPlusParams, temperatures: Temperatures | None = None) -> RPS
 
 def translation(params: RPSPlusParams, d: Array, yaw: Scalar) -> Twist:
     """Compute P2: the twist that moves the contact straight along d (2,) [m] in the world."""
-    error = planar.wrap(planar.direction(d) - yaw)
+    error = planar.bearing(d, yaw)
     speed = params.law.K_v * planar.norm(d)
     forward = jnp.maximum(jnp.cos(error), params.press)
     omega = jnp.zeros_like(error)

@@ -281,7 +281,7 @@ def step(
 
     # D2 and D3.
     d = displacement(sensed)
-    distance, e = planar.norm(d), planar.wrap(planar.direction(d) - yaw)
+    distance, e = planar.norm(d), planar.bearing(d, yaw)
     psi = push_direction(middle, p_world_axle, obs.p_world_target, params.r)
 
     # The end of a push.
@@ -325,7 +325,7 @@ def step(
     far = params.K_e * e + params.K_l * (l - jnp.clip(l, -params.l_dead, params.l_dead))
     arm = jnp.maximum(contact[0], _LEAST_ARM) + axle
     steer = where(near, params.K_near * v_max * jnp.sin(e) / arm, far)
-    approach = planar.wrap(planar.direction(middle - p_world_axle) - yaw)
+    approach = planar.bearing(middle - p_world_axle, yaw)
     steer = where(touches, steer, where(and_(is_new, touched), approach, 0.0))
     on_spot = 0.0 if least is None else -v_max
     is_large = above(jnp.abs(error), _LARGE, angle)

@@ -184,14 +184,14 @@ def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Array]:
 def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Physics) -> Contact:
     """Return the contacts of the object's side with the base, at the lower and upper edge."""
     k, b = _stiffness(physics.base_solref, _D_MAX, physics.timestep)
-    turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    turn = sp.turn(state.base[2])
     z, normal, q, distance = side_contacts(body, state, m, turn)
     n = *sp.turned(turn, normal), 0.0
     t = (-n[1], n[0], 0.0)
     arm = sp.turned(turn, q)  # from the base's origin
     r = (*sp.sub(sp.add(state.base[:2], arm), state.p[:2]), z - state.p[2])
-    *v, w = sp.turned(turn, twist) if state.driven is None else state.driven.v
-    of_base = (v[0] - w * arm[1], v[1] + w * arm[0], 0.0)
+    velocity = sp.turned(turn, twist) if state.driven is None else state.driven.v
+    of_base = (*sp.at_point(velocity, arm), 0.0)
     u = sp.sub(sp.add(state.v, sp.cross(sp.to_world(m, state.w), r)), of_base)
     x = jnp.minimum(jnp.abs(distance) / _WIDTH, 1.0)
     x = jnp.where(x < 0.5, 2 * x * x, 1 - 2 * (1 - x) * (1 - x))

@@ -109,8 +109,7 @@ def _rows(contact: Contact, x: Sequence[Vec]) -> Row:
     a, alpha, *base = x
     u = sp.add(a, sp.cross(alpha, contact.r))
     if base and contact.arm is not None:
-        (b_x, b_y, turn), (arm_x, arm_y) = *base, contact.arm
-        u = sp.sub(u, (b_x - turn * arm_y, b_y + turn * arm_x, 0.0))
+        u = sp.sub(u, (*sp.at_point(base[0], contact.arm), 0.0))
     rows = sp.dot(contact.n, u), sp.dot(contact.t, u), sp.dot(contact.s, u)
     if contact.radius is None:
         return rows
@@ -203,7 +202,7 @@ class Problem(NamedTuple):
                 torque = sp.add(torque, sp.scale(c.radius * force[3], c.n))
             g[:2] = sp.sub(g[0], sp.each(sp.total, f)), sp.sub(g[1], sp.each(sp.total, torque))
             if c.arm is not None:
-                g[2] = sp.add(g[2], sp.each(sp.total, _on_base(c.arm, f)))
+                g[2] = sp.add(g[2], sp.each(sp.total, sp.wrench(c.arm, f)))
             _stiffen(h, c, k)
         return [entry for block in g for entry in block], h
 
@@ -302,11 +301,6 @@ def _minimise(problem: Problem, physics: Physics) -> list[Vec]:
     )[1]
 
 
-def _on_base(arm: Point, f: Sequence[Number]) -> Vec:
-    """Return a force at an arm from the base's origin as x, y and torque about the origin."""
-    return f[0], f[1], sp.minus(sp.mul(arm[0], f[1]), sp.mul(arm[1], f[0]))
-
-
 def wrench_on_base(
     contact: Contact, arm: Point, x: Sequence[Vec], turn: Point, physics: Physics
 ) -> Vec:
@@ -320,7 +314,7 @@ def wrench_on_base(
       physics: with the friction cone.
     """
     force, _ = contact_force(contact, _at(contact, x), physics)
-    wrenches = _on_base(arm, sp.combine(force, (contact.n, contact.t, contact.s)))
+    wrenches = sp.wrench(arm, sp.combine(force, (contact.n, contact.t, contact.s)))
     wrench = sp.turned_back(turn, sp.each(sp.total, wrenches))
     return sp.each(lambda x: -x, wrench)  # the contacts' force is on the object
 
@@ -360,14 +354,14 @@ def _stiffen(h: list[list[Number]], c: Contact, k: Row) -> None:
     if c.arm is None:
         return
     # The base's rows: -B^T K (1, [r]^T, -B), where B maps the motion of its origin to the point's.
-    onto = [_on_base(c.arm, column) for column in columns]
+    onto = [sp.wrench(c.arm, column) for column in columns]
     for j in range(3):
-        twisted = _on_base(c.arm, [column[j] for column in turned])
+        twisted = sp.wrench(c.arm, [column[j] for column in turned])
         for i in range(3):
             h[6 + i][j] = sp.minus(h[6 + i][j], sp.total(onto[j][i]))
             h[6 + i][3 + j] = sp.minus(h[6 + i][3 + j], sp.total(twisted[i]))
     for i in range(3):
-        row = _on_base(c.arm, [column[i] for column in onto])
+        row = sp.wrench(c.arm, [column[i] for column in onto])
         for j in range(i + 1):
             h[6 + i][6 + j] = sp.plus(h[6 + i][6 + j], sp.total(row[j]))
 

@@ -83,7 +83,7 @@ def to_mujoco(body: Body, state: State, twist: Vec) -> Motion:
     v = sp.sub(state.v, sp.to_world(m, sp.cross(spin, com)))
     p = sp.sub(state.p, sp.to_world(m, com))
     if state.driven is None:
-        turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+        turn = sp.turn(state.base[2])
         base = sp.turned(turn, twist)
         last, integral = tuple(jnp.zeros_like(x) for x in state.base), None
     else:
@@ -112,7 +112,7 @@ def step(
     m, dt, driven = sp.matrix(state.q), physics.timestep, state.driven
     contacts = [on_ground(body, state, m, physics), on_base(body, state, m, twist, physics)]
     contacts += [on_wall(body, state, m, wall, physics) for wall in body.walls or ()]
-    turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    turn = sp.turn(state.base[2])
     base = Base()
     if robot is not None and driven is not None:
         force, integral = push(robot, driven.integral, twist, driven.v, turn, dt)
