@@ -32,7 +32,7 @@ from jax.typing import DTypeLike
 
 from rps_jax import spec
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Number, Pair
+from rps_jax.geometry.arrays import Array, Number, Pair, Scalar
 from rps_jax.geometry.vectors import Point, Vec, sub, turned, turned_back
 from rps_jax.robot.robot import Robot
 from rps_jax.spec import Spec
@@ -84,6 +84,11 @@ def observe_pose(
     return poses, delayed + sigma * normal(noise, (3,), pose.dtype)
 
 
+def low_pass(old: Array, new: Array, period: Scalar, time_constant: Number) -> Array:
+    """Return the output of a filter of first order, after a `period` [s] at the input `new`."""
+    return old + (1 - jnp.exp(-period / time_constant)) * (new - old)
+
+
 def normal(key: Array, shape: tuple[int, ...], dtype: DTypeLike) -> Array:
     """Return normal numbers that are equal in single and double precision."""
     return jax.random.normal(key, shape, jnp.float32).astype(dtype)
@@ -121,7 +126,7 @@ class LoadCell(NamedTuple):
         noise = jax.random.fold_in(jax.random.fold_in(key, _FORCE), steps)
         signal = load.signal
         raw = load.wrench[:2] + self.noise * normal(noise, (2,), signal.dtype)
-        signal = signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - signal)
+        signal = low_pass(signal, raw, period, self.time_constant)
         above = jnp.sum(signal * signal) >= self.threshold**2
         return load._replace(signal=signal), jnp.where(above, signal, 0.0)
 
@@ -178,8 +183,7 @@ def aim(robot: Robot, previous: Array, twist: Array, period: float) -> Array:
     if robot.omega_max is not None:
         twist = twist.at[2].set(jnp.clip(twist[2], -robot.omega_max, robot.omega_max))
     if robot.lag is not None:
-        share = 1 - jnp.exp(-period / jnp.maximum(robot.lag, 1e-9))
-        twist = previous + share * (twist - previous)
+        twist = low_pass(previous, twist, period, jnp.maximum(robot.lag, 1e-9))
     if robot.acceleration_max is not None:
         linear, turning = jnp.asarray(robot.acceleration_max) * period
         change = twist - previous
@@ -205,7 +209,7 @@ def _aim_axle(robot: Robot, previous: Array, twist: Array, period: float) -> Arr
     old, motion = jnp.stack([previous[0], previous[2]]), _steered(robot, twist[0], twist[2])
     motion = scaled(motion, v_max, robot.omega_max, robot.wheel_speed_max)
     if robot.lag is not None:
-        motion = old + (1 - jnp.exp(-period / jnp.maximum(robot.lag, 1e-9))) * (motion - old)
+        motion = low_pass(old, motion, period, jnp.maximum(robot.lag, 1e-9))
     bounds = (None, None) if robot.acceleration_max is None else robot.acceleration_max
     limits = *bounds, robot.wheel_acceleration_max
     steps = (None if x is None else x * period for x in limits)
@@ -286,11 +290,12 @@ def _axle_errors(robot: Robot, twist: Vec, errors: Vec, xp: ModuleType) -> Vec:
 
     A car that is slower than its aim turns less, with the same curvature.
     """
-    if robot.turning_radius is None:
-        return errors[0], 0.0 * errors[1], errors[2]
-    speed = xp.where(xp.abs(twist[0]) < 1e-9, 1e-9, twist[0])
-    share = xp.clip(1 - errors[0] / speed, 0.0, 1.0)
-    return errors[0], 0.0 * errors[1], errors[2] - (1 - share) * twist[2]
+    ahead, left, turn = errors
+    if robot.turning_radius is not None:
+        speed = xp.where(xp.abs(twist[0]) < 1e-9, 1e-9, twist[0])
+        share = xp.clip(1 - ahead / speed, 0.0, 1.0)
+        turn = turn - (1 - share) * twist[2]
+    return ahead, 0.0 * left, turn
 
 
 class Tyres(NamedTuple):
