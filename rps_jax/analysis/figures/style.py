@@ -13,6 +13,7 @@ from matplotlib.colors import TwoSlopeNorm as TwoSlopeNorm
 
 from rps_jax.analysis import statistics
 from rps_jax.geometry import solid
+from rps_jax.geometry.footprint import CORNERS
 from rps_jax.robot import shell
 from rps_jax.world.domain import LABELS
 
@@ -104,7 +105,7 @@ def base_patch(
     Its sizes are half length and width (2,) [m], or the radius (1,) [m]; a line shows the heading
     of a round base.
     """
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+    corners = CORNERS
     if len(sizes) == 1:
         corners = np.append(solid.unit(np.linspace(0, 2 * np.pi, 49)), [[0, 0]], axis=0)
     corners = corners * np.asarray(sizes)
