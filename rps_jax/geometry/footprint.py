@@ -28,7 +28,8 @@ class Footprint(NamedTuple):
 @jax.jit
 def rectangle(half_x: Scalar, half_y: Scalar) -> Footprint:
     """Return a rectangle of sides 2 half_x by 2 half_y [m] about the origin."""
-    return Footprint(jnp.stack([jnp.asarray(half_x), jnp.asarray(half_y)]) * CORNERS, jnp.zeros(()))
+    half = jnp.stack([jnp.asarray(half_x), jnp.asarray(half_y)])
+    return Footprint(jnp.array(CORNERS) * half, jnp.zeros(()))
 
 
 def circle(radius: Number) -> Footprint:
