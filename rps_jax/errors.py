@@ -30,6 +30,11 @@ _MAX_WORD = 200  # characters; most paths are shorter
 _LONG_WORD = re.compile(rf"(\S{{60}})\S{{{_MAX_WORD - 60},}}?([^\w\s]{{0,3}})(?!\S)")
 
 
+def one_line(error: object) -> str:
+    """Return the text of an error in one line."""
+    return " ".join(str(error).split())
+
+
 def not_allowed(name: str, value: object, rule: str) -> InputError:
     """Return the error of a value that breaks a rule, which also says how to fix it."""
     return InputError(f"{name} = {value} is not allowed: {rule}.")

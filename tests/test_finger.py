@@ -126,7 +126,7 @@ def measured():
 
 def test_a_fit_finds_the_object_and_predicts_other_pushes(measured):
     few = Pushes(*(x[:12] for x in measured))
-    fitted = objects.fit(SQUARE, few, RADIUS)
+    fitted = rps_jax.fit_object(SQUARE, few, RADIUS)
     data = fitted.data
     found = data.sel(parameter=list(TRUTH))
     off = (found["mean"].values - list(TRUTH.values())) / found.deviation.values
@@ -144,7 +144,7 @@ def test_a_fit_finds_the_object_and_predicts_other_pushes(measured):
 def test_what_the_model_leaves_corrects_pushes_nearby(measured):
     few = Pushes(*(x[:12].copy() for x in measured))
     few.end[0, 0] += 2e-3
-    fitted = objects.fit(SQUARE, few, RADIUS)
+    fitted = rps_jax.fit_object(SQUARE, few, RADIUS)
     without = replace(fitted, nearby=ObjectFit.nearby)
     change = (fitted.predict(few).pose - without.predict(few).pose).values
     assert change[0, 0] > 3 * np.median(np.abs(change[1:, 0]))
@@ -153,7 +153,9 @@ def test_what_the_model_leaves_corrects_pushes_nearby(measured):
 
 
 def test_an_object_on_known_feet_is_fitted(measured):
-    fitted = objects.fit(SQUARE, Pushes(*(x[:6] for x in measured)), RADIUS, feet=0.8 * SQUARE[:3])
+    fitted = rps_jax.fit_object(
+        SQUARE, Pushes(*(x[:6] for x in measured)), RADIUS, feet=0.8 * SQUARE[:3]
+    )
     assert_allclose(fitted.feet[:, :2], 0.8 * SQUARE[:3])
     assert_allclose(fitted.feet[:, 2].sum(), 1.0, atol=1e-6)
 

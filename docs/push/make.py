@@ -332,7 +332,7 @@ _LISTED = 12  # elements of an array that is printed as a list, at most
 class _LoopBuilder(ScalarBuilder):
     """Target whose loops may run until a condition fails: a page has no deadline."""
 
-    while_loop = GraphBuilder.while_loop
+    loops = GraphBuilder.loops
 
 
 class PageWriter(JsWriter):

@@ -104,6 +104,10 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
         trials = results.sel(law=law)
         success = trials.success.values > 0
         mode_index = statistics.failure_modes(trials, max_lost)
+        distance = statistics.distance_left(trials)
+        low, high = statistics.cvar_interval(distance)
+        known = high < np.inf
+        interval = f"[{low:.2f}, {high:.2f}]" if known else "(too few worlds for an interval)"
         most = statistics.fails_at_most(int((~success).sum()), success.size, laws)
         rows.append(
             [
@@ -111,18 +115,12 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
                 *(rate(success[mask]) for mask in groups.values()),
                 rate(success),
                 f"{100 * most:.{0 if most > 0.1 else 2 if most > 0.001 else 4}f} %",
-                _cvar(statistics.distance_left(trials)),
+                f"{statistics.cvar(distance):.2f} m {interval}",
                 *(median(trials[name].values[success], text) for name, text in medians.values()),
                 *(str(int((mode_index == statistics.modes().index(mode)).sum())) for mode in modes),
             ]
         )
     return rows
-
-
-def _cvar(distance: np.ndarray) -> str:
-    low, high = statistics.cvar_interval(distance)
-    interval = f"[{low:.2f}, {high:.2f}]" if high < np.inf else "(too few worlds for an interval)"
-    return f"{statistics.cvar(distance):.2f} m {interval}"
 
 
 def task_table(results: xr.Dataset) -> list[list[str]]:

@@ -95,10 +95,9 @@ class Drawing:
         self._contact = world.add_icosphere(
             f"{_ROOT}/base/contact", rendering.CONTACT_RADIUS, color=_rgb(rendering.CONTACT_RGBA)
         )
-        pin = _solid_of(mujoco.mjtGeom.mjGEOM_CYLINDER, np.array(rendering.PIN))
-        meshes = np.asarray(pin.vertices), np.asarray(pin.faces)
+        pin = _mesh_of_kind(mujoco.mjtGeom.mjGEOM_CYLINDER, np.array(rendering.PIN))
         self._remembered = world.add_mesh_simple(
-            f"{_ROOT}/remembered", *meshes, color=_rgb(rendering.PIN_RGBA), visible=False
+            f"{_ROOT}/remembered", *pin, color=_rgb(rendering.PIN_RGBA), visible=False
         )
         nowhere = np.zeros((1, 2, 3))
         shape: dict[str, Any] = {"shaft_radius": 0.016, "head_radius": 0.045, "head_length": 0.1}
@@ -151,16 +150,14 @@ class Drawing:
         self._remembered.visible = not math.isnan(x)
         if self._remembered.visible:
             self._remembered.position = (x, y, rendering.PIN[1])
-        self._show_twist(*map(float, moment.snapshot.twist))
-        way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
-        self._base_path.points = _joined([m.snapshot.qpos[:2] for m in way], 0.006)
-        self._contact_path.points = _joined([m.p_world_contact for m in way], 0.012)
-
-    def _show_twist(self, v_x: float, v_y: float, omega: float) -> None:
-        """Show the velocities of the left and the right side of the base by arrows."""
+        # Velocities of the left and the right side of the base.
+        v_x, v_y, omega = map(float, moment.snapshot.twist)
         velocities = np.array([[v_x - omega * y, v_y + omega * x, 0.0] for x, y, _ in _SHOULDERS])
         self._velocity.points = np.stack([_SHOULDERS, _SHOULDERS + _ARROW * velocities], axis=1)
         self._velocity.visible = bool(np.abs(velocities).max() > 1e-3)
+        way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
+        self._base_path.points = _joined([m.snapshot.qpos[:2] for m in way], 0.006)
+        self._contact_path.points = _joined([m.p_world_contact for m in way], 0.012)
 
 
 def _joined(points: Sequence[ArrayLike], height: float) -> np.ndarray:
@@ -181,11 +178,9 @@ def _add_taxels(world: SceneApi, name: str, shell: Shell) -> Any:
     middles = quarters.mean(axis=1) + (depth / 2 - 0.004) * inward
     centers = np.column_stack([middles, np.full(len(middles), z)])
     zero = 0 * lengths
-    box = _solid_of(mujoco.mjtGeom.mjGEOM_BOX, np.full(3, 0.5))
     return world.add_batched_meshes_simple(
         name,
-        np.asarray(box.vertices),
-        np.asarray(box.faces),
+        *_mesh_of_kind(mujoco.mjtGeom.mjGEOM_BOX, np.full(3, 0.5)),
         batched_wxyzs=solid.quaternion(np.arctan2(along[:, 1], along[:, 0])),
         batched_positions=centers,
         batched_scales=np.stack([0.92 * lengths, depth + zero, height + zero], axis=-1),
@@ -210,26 +205,27 @@ def _add_geoms(world: SceneApi, model: mujoco.MjModel) -> None:
 def _mesh_of(model: mujoco.MjModel, geom: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) [m] and faces (F, 3) of a geom in its frame."""
     if geom.type[0] != mujoco.mjtGeom.mjGEOM_MESH:
-        round_ = _solid_of(geom.type[0], geom.size)
-        return np.asarray(round_.vertices), np.asarray(round_.faces)
+        return _mesh_of_kind(geom.type[0], geom.size)
     mesh = model.mesh(int(geom.dataid[0]))
     vertices = slice(mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0])
     faces = slice(mesh.faceadr[0], mesh.faceadr[0] + mesh.facenum[0])
     return model.mesh_vert[vertices], model.mesh_face[faces]
 
 
-def _solid_of(kind: int, size: np.ndarray) -> Any:
-    """Return a primitive of MuJoCo, for trimesh."""
+def _mesh_of_kind(kind: int, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) [m] and faces (F, 3) of a primitive of MuJoCo."""
     from trimesh import creation  # comes with viser
 
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return creation.box(extents=2 * size)
-    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return creation.cylinder(radius=size[0], height=2 * size[1], sections=_SIDES)
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return creation.capsule(radius=size[0], height=2 * size[1], count=(_SIDES // 2, 12))
-    round_ = creation.icosphere()  # a sphere, or an ellipsoid
-    return round_.apply_scale(size if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0])
+        mesh: Any = creation.box(extents=2 * size)
+    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        mesh = creation.cylinder(radius=size[0], height=2 * size[1], sections=_SIDES)
+    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        mesh = creation.capsule(radius=size[0], height=2 * size[1], count=(_SIDES // 2, 12))
+    else:  # a sphere, or an ellipsoid
+        is_ellipsoid = kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID
+        mesh = creation.icosphere().apply_scale(size if is_ellipsoid else size[0])
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
 def _colour_of(model: mujoco.MjModel, geom: Any) -> tuple[int, int, int]:

@@ -61,6 +61,10 @@ SpeedMax = Annotated[Parameter, Spec("m/s", "bound on the speed", gt=0)]
 OmegaMax = Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)]
 ApproachSpeed = Annotated[Parameter, Spec("m/s", "forward speed before the first contact", 0)]
 SuccessDistance = Annotated[Parameter, Spec("m", "target reached", gt=0)]
+# State of several laws.
+LastContact = Annotated[Array, Spec("m", "the last contact")]  # (2,)
+Touched = Annotated[Array, Spec("1", "whether there was a contact")]  # () bool
+TimeLost = Annotated[Array, Spec("s", "time since the last contact")]  # ()
 
 T = TypeVar("T")
 Leaf = float | np.ndarray | Array  # of a pytree of parameters

@@ -34,11 +34,6 @@ class Box(NamedTuple):
         return Box(turned(self.h, leg), turned(self.known, leg), centred)
 
 
-def unknown_box(h: Array) -> Box:
-    """Return a box with supports (4,) [m] that were not felt."""
-    return Box(h, jnp.zeros(4, bool), jnp.zeros(2, bool))
-
-
 def extents(h: Array) -> tuple[Array, Array]:
     """Return the middle (2,) and the half widths (2,) of supports (4,), along and across [m]."""
     return (h[:2] - h[2:]) / 2, jnp.clip((h[:2] + h[2:]) / 2, *_HALF)

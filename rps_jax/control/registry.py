@@ -151,6 +151,11 @@ def check_drive(params: LawParams, drive: DriveKind) -> None:
     raise errors.not_allowed("law", _name_of(params), rule)
 
 
+def preset_of(params: object) -> LawParams | None:
+    """Return the first registered parameters of the same class."""
+    return next((x for x in LAWS.values() if type(x) is type(params)), None)
+
+
 def _name_of(params: LawParams) -> str:
     """Return the name of a law with these parameters, or of the first with parameters like them."""
     leaves, kind = jax.tree.leaves(params), type(params)

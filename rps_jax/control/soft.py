@@ -4,6 +4,7 @@ A condition of a law is a bool. In the smooth form of a law it is a weight from 
 operators here mix the alternatives by this weight, so that the law is differentiable.
 """
 
+from functools import partial
 from typing import TypeVar
 
 import jax
@@ -51,4 +52,4 @@ def where(condition: Array, x: ArrayLike, y: ArrayLike) -> Array:
 
 def tree_where(condition: Array, x: T, y: T) -> T:
     """Apply `where` to the leaves of two pytrees."""
-    return jax.tree.map(lambda a, b: where(condition, a, b), x, y)
+    return jax.tree.map(partial(where, condition), x, y)

@@ -29,7 +29,7 @@ from rps_jax.control.observation import (
     TaxelObservation,
     Twist,
 )
-from rps_jax.errors import InputError, not_allowed
+from rps_jax.errors import InputError, not_allowed, one_line
 from rps_jax.geometry.arrays import Pytree
 
 Function = Callable[..., object]
@@ -157,7 +157,7 @@ def _trace(name: str, function: Function, *args: object) -> object:
 
 def fault_of(error: BaseException) -> str:
     """Return the verb phrase of a function whose trace fails with an error."""
-    reason = " ".join(str(error).split())[:300].rstrip(".")
+    reason = one_line(error)[:300].rstrip(".")
     raised = f"raises {type(error).__name__}" + (f" ({reason})" if reason else "")
     return next((t for kind, t in _TRACER_ERRORS.items() if isinstance(error, kind)), raised)
 

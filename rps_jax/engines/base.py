@@ -90,9 +90,7 @@ class Stage(Protocol):
 class HostBatch(Protocol):
     """Worlds that an engine steps on the host, in double precision."""
 
-    def set_positions(self, rows: np.ndarray, qpos: np.ndarray) -> None:
-        """Set the positions (n, 10) of the worlds `rows` (n,)."""
-        ...
+    qpos: np.ndarray  # (n, 10) positions; a shift writes them
 
     def drive(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:
         """Step the worlds `rows` (n,) with their bases at `twist` (n, 3), in the base's frame."""

@@ -21,8 +21,10 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.geometry import planar
+from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Array, Entries, Float, Pytree
 from rps_jax.geometry.friction import friction_of_pads, solved
+from rps_jax.geometry.polyline import is_inside
 from rps_jax.geometry.vectors import Vec, trace_one_world
 
 STEPS = 50  # of a push; with 100, ends move by 0.03 mm of 50 mm in the median
@@ -90,7 +92,8 @@ def uniform_pads(outline: np.ndarray, count: int = _NODES) -> np.ndarray:
     width = (high - low) / cells
     at = [low[k] + width[k] / fine * (np.arange(cells[k] * fine) + 0.5) for k in (0, 1)]
     points = np.stack(np.meshgrid(*at, indexing="ij"), axis=-1)
-    inside = distances(outline, points.reshape(-1, 2)) < 0
+    corners = outline @ (1, 1j)
+    inside = is_inside((points @ (1, 1j)).reshape(-1, 1), corners, np.roll(corners, -1))
     weight = inside.reshape(cells[0], fine, cells[1], fine)
     at_cell = points.reshape(cells[0], fine, cells[1], fine, 2)
     load = weight.sum(axis=(1, 3)).astype(float)
@@ -133,12 +136,6 @@ def _push(slider: Slider, path: Array, pose: Array, steps: int) -> Pushed:
     (last, _), (poses, gaps) = jax.lax.scan(step, first, tip)
     gap = gap_of(slider, last, tips[-1])[0]
     return Pushed(jnp.concatenate([poses, last[None]]), jnp.append(gaps, gap))
-
-
-def distances(outline: ArrayLike, points: ArrayLike) -> np.ndarray:
-    """Return signed distances (P,) [m] of points (P, 2) from a polygon, negative inside."""
-    corners = jnp.asarray(outline)
-    return np.asarray(jax.vmap(lambda point: _nearest(corners, point)[0])(jnp.asarray(points)))
 
 
 def _nearest(outline: Array, point: Array) -> tuple[Array, Array]:
@@ -223,7 +220,7 @@ def _iterate(refine: Callable[[tuple], tuple], start: tuple) -> tuple:
 def _power(pads: tuple, v: Vec) -> Array:
     """Return the power of friction at a twist."""
     x, y, share, radius = pads
-    u, w = v[0] - v[2] * y, v[1] + v[2] * x
+    u, w = sp.at_point(v, (x, y))
     return share @ jnp.sqrt(u * u + w * w + (v[2] * radius) ** 2 + _SMOOTH**2)
 
 
@@ -274,9 +271,8 @@ def _slide(pads: tuple, force: Array, flow: Array, stuck: Array) -> Array:
     def refine(carry: tuple) -> tuple:
         v: Entries = tuple(carry[0])
         gradient, hessian = friction_of_pads(fixed, v, _SMOOTH)
-        excess: Entries = tuple(g - f for g, f in zip(gradient, pull, strict=True))
-        change = solved(excess, hessian)
-        tried = [tuple(a - s * b for a, b in zip(v, change, strict=True)) for s in _LENGTHS]
+        change = solved(sp.sub(gradient, pull), hessian)
+        tried = [sp.sub(v, sp.scale(s, change)) for s in _LENGTHS]
         costs = jnp.stack([cost(x) for x in tried])
         best = jnp.argmin(costs)
         return (jnp.stack([jnp.stack(x) for x in tried])[best],)
@@ -286,6 +282,5 @@ def _slide(pads: tuple, force: Array, flow: Array, stuck: Array) -> Array:
     guess = jnp.where(cost(tuple(flow)) < cost(tuple(scaled)), flow, scaled)
     v = tuple(jax.lax.stop_gradient(_iterate(refine, (guess,))[0]))
     gradient, hessian = friction_of_pads(pads, v, _SMOOTH)
-    rest = (gradient[0] - force[0], gradient[1] - force[1], gradient[2])
-    change = solved(rest, jax.lax.stop_gradient(hessian))
-    return jnp.stack([a - b for a, b in zip(v, change, strict=True)])
+    rest = sp.sub(gradient, (force[0], force[1], 0.0))
+    return jnp.stack(sp.sub(v, solved(rest, jax.lax.stop_gradient(hessian))))

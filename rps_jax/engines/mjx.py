@@ -166,10 +166,6 @@ class MJX(Engine):
     name = "mjx"
     modes = ("forward", "reverse")
 
-    def put_model(self, physics: mujoco.MjModel) -> mjx.Model:
-        """Return the model of a scene on the device."""
-        return mjx.put_model(physics)
-
     def stage(self, inputs: WorldInputs) -> tuple[MJXStage, Arrays]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
         walls = inputs.surroundings.walls

@@ -27,6 +27,7 @@ import numpy as np
 from rps_jax.engines.fused.contacts import Corners, side_contacts
 from rps_jax.geometry import vectors
 from rps_jax.geometry.arrays import Array, Entries, Pytree
+from rps_jax.geometry.footprint import CORNERS
 from rps_jax.world import opengl as opengl  # imports MuJoCo
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
@@ -77,8 +78,7 @@ def corners_of(model: Model, outline: Array | None = None) -> Array:
     """Return the corners (N, 3) [m] of box or prism in its body, or the middle of a cylinder."""
     boxes = geoms(model, _OBJECT, GeomType.BOX)
     if boxes.size:
-        signs = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1]])
-        return model.geom_size[boxes[0]] * signs
+        return model.geom_size[boxes[0]] * np.insert(CORNERS, 2, -1.0, axis=1)
     if not geoms(model, _OBJECT, GeomType.MESH).size:
         return jnp.zeros((1, 3))
     corners = model.geom_pos[geoms(model, _OBJECT, GeomType.SPHERE)]

@@ -31,11 +31,6 @@ def _without_reset(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def _in_base(wrench: np.ndarray, turn: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return wrenches (n, 3) of the world's axes in the base's frame, from (cos, sin) (n,)."""
-    return np.stack([*turned_back(turn, tuple(wrench.T)), wrench.T[2]], axis=1)
-
-
 class Batch:
     """Worlds stepped by C MuJoCo on a pool of threads; the state is (time, qpos, qvel)."""
 
@@ -82,10 +77,6 @@ class Batch:
         # A diverged world is an outcome; MuJoCo would write its warnings to a file.
         mujoco.set_mju_user_warning(lambda _: None)
 
-    def set_positions(self, rows: np.ndarray, qpos: np.ndarray) -> None:
-        """Set the positions (n, 10) of the worlds `rows` (n,)."""
-        self.qpos[rows] = qpos
-
     @property
     def driven(self) -> Driven:
         """Motion and force of all worlds."""
@@ -104,10 +95,9 @@ class Batch:
             self._push(rows, twist, substeps)
             return
         state, warmstart, nq = self.state[rows], self.warmstart[rows], self.qpos.shape[1]
-        omega = twist.T[2]
-        yaw = state[:, 1 + JOINTS.base.start + 2] + omega * (substeps * self._timestep / 2)
+        yaw = state[:, 1 + JOINTS.base.start + 2] + twist[:, 2] * (substeps * self._timestep / 2)
         turn = np.cos(yaw), np.sin(yaw)
-        velocity = np.stack([*turned(turn, tuple(twist.T)), omega], axis=1)
+        velocity = np.stack(turned(turn, tuple(twist.T)), axis=1)
         state[:, 1 + nq :][:, JOINTS.base] = velocity
         states = self._rollout(rows, state, warmstart, nstep=substeps)
         previous = states[:, -2] if substeps > 1 else state
@@ -116,7 +106,7 @@ class Batch:
         # Only contact changes the velocity of the base, by a small amount: that gives its force.
         gained = states[:, -1, 1 + nq :][:, JOINTS.base] - state[:, 1 + nq :][:, JOINTS.base]
         wrench = self._inertia[rows] * gained / (substeps * self._timestep) - self._weight[rows]
-        self.force[rows] = _in_base(wrench, turn)
+        self.force[rows] = np.stack(turned_back(turn, tuple(wrench.T)), axis=1)
         self.state[rows], self.warmstart[rows] = states[:, -1], change / self._timestep
 
     def _push(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:
@@ -145,7 +135,8 @@ class Batch:
             if tyres is not None:  # what the tyres hold is not of the contact
                 held = sum(a * b for a, b in zip(tyres.sideways, warmstart.T, strict=False))
                 contact += np.stack(tyres.along(tyres.mass * (held - tyres.rest)), axis=1)
-            wrench += _in_base(contact - self._weight[rows], turn) / substeps
+            on_base = turned_back(turn, tuple((contact - self._weight[rows]).T))
+            wrench += np.stack(on_base, axis=1) / substeps
             state = following
         self.state[rows], self.warmstart[rows] = state, warmstart
         self.integral[rows] = np.stack(integral, axis=1)

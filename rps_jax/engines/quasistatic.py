@@ -124,21 +124,23 @@ def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tupl
     A pose is x, y [m], yaw [rad] in the world, for the object of its centre of mass.
     """
     base, pushed = poses
-    turn = jnp.cos(base[2]), jnp.sin(base[2])
-    p = sp.turned_back(turn, (pushed[0] - base[0], pushed[1] - base[1]))
+    turn = sp.turn(base[2])
+    *p, yaw = sp.turned_back(turn, sp.sub(pushed, base))
     v_x, v_y, omega = twist
-    reach = sp.dot(slider.base_size, slider.base_size)
+    reach, pads = sp.dot(slider.base_size, slider.base_size), slider.pads
+    if pads is not None:
+        pads = sp.turned(sp.turn(yaw), pads)
     problem = Problem(
-        _contacts(slider, (*p, pushed[2] - base[2]), twist),
+        _contacts(slider, (p[0], p[1], yaw), twist),
         jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _MIN_SPEED**2),
         slider.arm,
         slider.friction_robot,
-        None if slider.pads is None else _turned(slider.pads, pushed[2] - base[2]),
+        pads,
     )
-    v = solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
+    v = solve(problem, (*sp.at_point(twist, p), omega), dt)
 
     def moved(x: Vec, u: Vec) -> Vec:
-        return sp.add(x, sp.scale(dt, (*sp.turned(turn, u), u[2])))
+        return sp.add(x, sp.scale(dt, sp.turned(turn, u)))
 
     return moved(base, twist), moved(pushed, v)
 
@@ -169,7 +171,7 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
     stiff = 1 / problem.speed
     if problem.pads is None:
         inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
-        gradient: Vec = (inertia[0] * v[0], inertia[1] * v[1], inertia[2] * v[2])
+        gradient = sp.each(sp.mul, inertia, v)
         hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in ENTRIES]
     else:
         gradient, hessian = friction_of_pads(problem.pads, v, _LEAST_PACE * problem.speed)
@@ -177,13 +179,13 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
     for contact in problem.contacts:
         n, r = contact.normal, contact.r
         t = (-n[1], n[0])
-        u = (v[0] - v[2] * r[1] - contact.v[0], v[1] + v[2] * r[0] - contact.v[1])
+        u = sp.sub(sp.at_point(v, r), contact.v)
         v_t = sp.dot(t, u)
         slide = jnp.sqrt(v_t * v_t + tiny * tiny)  # a smooth |v_t|
         inside = -contact.gap - dt * (sp.dot(n, u) - friction * (slide - tiny))
         force, stiffness = _spring(inside)
-        along = _with_moment(t, r)
-        push = sp.sub(_with_moment(n, r), sp.scale(friction * v_t / slide, along))
+        along = sp.wrench(r, t)
+        push = sp.sub(sp.wrench(r, n), sp.scale(friction * v_t / slide, along))
         gradient = sp.sub(gradient, sp.scale(force, push))
         bend = force * friction * tiny * tiny / (slide * slide * slide)
         hessian = [
@@ -191,11 +193,6 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
             for h, (i, j) in zip(hessian, ENTRIES, strict=True)
         ]
     return gradient, hessian
-
-
-def _turned(pads: tuple[Number, ...], yaw: Number) -> tuple[Number, ...]:
-    """Return the rows of pads turned by an angle [rad]."""
-    return *sp.turned((jnp.cos(yaw), jnp.sin(yaw)), pads), *pads[2:]
 
 
 def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
@@ -209,25 +206,19 @@ def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
         normal, point, gap = circle_and_base((corners[0][0], corners[1][0]), radius, size)
         points, gaps = [point], [gap]
     else:
-        ahead = (jnp.roll(corners[0], -1, axis=0), jnp.roll(corners[1], -1, axis=0))
+        ahead = sp.each(lambda x: jnp.roll(x, -1, axis=0), corners)
         normal, middles, gaps = polygon_and_base(corners, ahead, size)
         gaps = [gap - radius for gap in gaps]
-        off = 0.5 * radius
-        points = [(q[0] - off * normal[0], q[1] - off * normal[1]) for q in middles]
+        points = [sp.sub(q, sp.scale(0.5 * radius, normal)) for q in middles]
     return [
         Contact(
             normal,
-            (q[0] - p_x, q[1] - p_y),
-            (twist[0] - twist[2] * q[1], twist[1] + twist[2] * q[0]),
+            sp.sub(q, pose[:2]),
+            sp.at_point(twist, q),
             gap,
         )
         for q, gap in zip(points, gaps, strict=True)
     ]
-
-
-def _with_moment(direction: Point, r: Point) -> Vec:
-    """Return a unit force at r with its moment."""
-    return (*direction, r[0] * direction[1] - r[1] * direction[0])
 
 
 def _spring(inside: Number) -> tuple[Number, Number]:

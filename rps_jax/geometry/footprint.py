@@ -15,6 +15,8 @@ from rps_jax import errors
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Float, Floats, Number, Scalar, Vector
 
+CORNERS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])  # of a square
+
 
 class Footprint(NamedTuple):
     """Set of points within `radius` of the convex hull of `vertices`, in the object's frame."""
@@ -26,8 +28,8 @@ class Footprint(NamedTuple):
 @jax.jit
 def rectangle(half_x: Scalar, half_y: Scalar) -> Footprint:
     """Return a rectangle of sides 2 half_x by 2 half_y [m] about the origin."""
-    signs = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    return Footprint(signs * jnp.stack([jnp.asarray(half_x), jnp.asarray(half_y)]), jnp.zeros(()))
+    half = jnp.stack([jnp.asarray(half_x), jnp.asarray(half_y)])
+    return Footprint(jnp.array(CORNERS) * half, jnp.zeros(()))
 
 
 def circle(radius: Number) -> Footprint:

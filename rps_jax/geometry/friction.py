@@ -14,11 +14,11 @@ ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric mat
 def friction_of_pads(pads: tuple[Number, ...], v: Vec, pace: Number) -> tuple[Vec, list[Number]]:
     """Return gradient and upper Hessian of D^2 / 2, with D the power of friction over its force."""
     x, y, share, radius = pads
-    u = v[0] - v[2] * y, v[1] + v[2] * x, v[2] * radius
+    u = *sp.at_point(v, (x, y)), v[2] * radius
     speed = jnp.sqrt(sp.dot(u, u) + pace * pace)
     load, total = share / speed, sp.total(share * speed)
     flow = u[0], u[1], x * u[1] - y * u[0] + radius * u[2]
-    slope: Vec = tuple(sp.total(load * f) for f in flow)  # pyright: ignore[reportAssignmentType]
+    slope = sp.each(lambda f: sp.total(load * f), flow)
     one = jnp.ones_like(x)
     metric = one, 0 * x, -y, one, x, x * x + y * y + radius * radius
     hessian: list[Number] = [

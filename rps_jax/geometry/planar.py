@@ -9,7 +9,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from rps_jax.geometry.arrays import Array, Float, Floats, Scalar
+from rps_jax.geometry.arrays import Array, Float, Floats, PerWorld, Scalar
 
 
 def rotate(
@@ -68,6 +68,11 @@ def wrap(angle: Floats) -> Floats:
     wrapped = jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
     # Rounding can return the excluded end.
     return jnp.where(wrapped >= jnp.pi, wrapped - 2 * jnp.pi, wrapped)
+
+
+def bearing(vector: Float[Array, "*B 2"], heading: PerWorld) -> Floats:
+    """Return the angle (...) [rad] from a heading to planar vectors (..., 2), in [-pi, pi)."""
+    return wrap(direction(vector) - heading)
 
 
 def safe_sqrt(x: Floats) -> Floats:

@@ -11,7 +11,18 @@ import numpy as np
 
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Entries, Float, Int, Pair, Scalar, Vector, namespace_of
+from rps_jax.geometry import vectors as sp
+from rps_jax.geometry.arrays import (
+    Array,
+    Entries,
+    Float,
+    Int,
+    Number,
+    Pair,
+    Scalar,
+    Vector,
+    namespace_of,
+)
 from rps_jax.geometry.footprint import Footprint
 
 
@@ -101,14 +112,14 @@ def clearance(
         square, low, high, gap = least
         corner = corners[i, 0], corners[i, 1]
         edge = _Vectors.from_components(ahead[i, 0] - corner[0], ahead[i, 1] - corner[1])
-        to_corner = corner[0] - start[0], corner[1] - start[1]
+        to_corner = sp.sub(corner, start)
         to_start = -to_corner[0], -to_corner[1]
-        to_end = to_start[0] + along.x, to_start[1] + along.y
+        to_end = sp.add(to_start, along[:2])
         for way, segment in ((to_corner, along), (to_start, edge), (to_end, edge)):
             square = jnp.minimum(square, _square(way, segment))
-        height = _dot(to_corner, normal)
+        height = sp.dot(to_corner, normal)
         # The normal of an edge points into the outline, whose corners turn to the left.
-        inside = jnp.maximum(_dot(to_start, edge.normal), _dot(to_end, edge.normal))
+        inside = jnp.maximum(sp.dot(to_start, edge.normal), sp.dot(to_end, edge.normal))
         gap = jnp.maximum(gap, jnp.where(edge.inverse > 0, -inside, -jnp.inf))
         return square, jnp.minimum(low, height), jnp.maximum(high, height), gap
 
@@ -155,23 +166,19 @@ class _Vectors(NamedTuple):
         return -self.y * scale, self.x * scale
 
 
-def _dot(a: Pair, b: Pair) -> Array:
-    return a[0] * b[0] + a[1] * b[1]
-
-
 def _share(way: Pair, along: _Vectors) -> Array:
     """Return the point of segments nearest to a point, as a share of a segment's length.
 
     `way` [m] is from a segment's start to the point.
     """
-    return jnp.clip(_dot(way, along[:2]) * along.inverse, 0.0, 1.0)
+    return jnp.clip(sp.dot(way, along[:2]) * along.inverse, 0.0, 1.0)
 
 
-def _square(way: Pair, along: _Vectors) -> Array:
+def _square(way: Pair, along: _Vectors) -> Number:
     """Return the squared distance [m^2] of points from segments: see `_share`."""
     share = _share(way, along)
-    away = way[0] - share * along.x, way[1] - share * along.y
-    return _dot(away, away)
+    away = sp.sub(way, sp.scale(share, along[:2]))
+    return sp.dot(away, away)
 
 
 # --- segments between complex numbers, in NumPy --------------------------------------------------

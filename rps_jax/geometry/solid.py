@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.geometry import vectors
+from rps_jax.geometry.footprint import CORNERS
 
 GRAVITY = 9.81  # [m/s^2]
 SIDES = 8  # vertices of a prism at most; those of fewer sides repeat some
@@ -144,7 +145,7 @@ def on_support(solid: Solid, kind: np.ndarray) -> Solid:
     if not is_round:
         angle = np.arctan2(vertices[..., 1], vertices[..., 0]) / (2 * np.pi)
         cell = np.floor(_OUTER * angle + 0.5).astype(int) % _OUTER
-        real = np.any(vertices != np.roll(vertices, 1, axis=1), axis=2).astype(float)
+        real = distinct(vertices).astype(float)
         parts.append((np.maximum(kind - 1, 0), vertices, real, cell))
     moments = np.zeros((len(kind), PADS, 4))
     for share, points, load, cell in parts:
@@ -184,10 +185,14 @@ def padded(vertices: np.ndarray) -> np.ndarray:
     return np.concatenate([vertices, np.repeat(vertices[..., -1:, :], missing, axis=-2)], axis=-2)
 
 
+def distinct(vertices: np.ndarray) -> np.ndarray:
+    """Return which corners (..., N) of outlines (..., N, 2) do not repeat the one before."""
+    return np.any(vertices != np.roll(vertices, 1, axis=-2), axis=-1)
+
+
 def rectangles(half_x: np.ndarray, half_y: np.ndarray) -> np.ndarray:
     """Return outlines (n, 4, 2) [m] of boxes, in the order of `footprint.rectangle`."""
-    signs = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    return signs * np.stack([half_x, half_y], axis=-1)[:, None, :]
+    return CORNERS * np.stack([half_x, half_y], axis=-1)[:, None, :]
 
 
 def centred(vertices: np.ndarray) -> np.ndarray:
@@ -222,8 +227,7 @@ def corners(solid: Solid) -> np.ndarray:
     """Count the corners (n,) of the outlines, repeated ones once; 0 for a cylinder."""
     if solid.vertices.shape[1] == 1:
         return np.zeros(solid.mass.size)
-    distinct = np.any(solid.vertices != np.roll(solid.vertices, 1, axis=1), axis=2)
-    return distinct.sum(axis=1).astype(float)
+    return distinct(solid.vertices).sum(axis=1).astype(float)
 
 
 def extent(solid: Solid, yaw: np.ndarray) -> np.ndarray:
@@ -292,7 +296,7 @@ def support(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
         return solid.feet[..., :2], solid.feet[..., 2]
     at = solid.vertices
     if at.shape[-2] > 1:
-        return at, np.any(at != np.roll(at, 1, axis=-2), axis=-1).astype(float)
+        return at, distinct(at).astype(float)
     x, y, _ = solid.p_object_com.T
     lean = np.arctan2(y, x)[:, None] + np.array([0, 2, 4]) * np.pi / 3
     rim = solid.radius[:, None, None] * unit(lean)

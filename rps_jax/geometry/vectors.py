@@ -7,13 +7,16 @@ which halves programs with axis-aligned directions.
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import reduce
+from functools import partial, reduce
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 
 from rps_jax.geometry.arrays import Number
 
 Vec = tuple[Number, Number, Number]
+Point = tuple[Number, Number]
+V = TypeVar("V", bound=Sequence[Number])  # a vector of any length
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
@@ -38,19 +41,25 @@ def minus(a: Number, b: Number) -> Number:
     return a if isinstance(b, float) and b == 0.0 else a - b
 
 
-def add(a: Vec, b: Vec) -> Vec:
+def each(function: Callable[..., Number], a: V, *others: Sequence[Number]) -> V:
+    """Apply a function to the entries of vectors."""
+    entries: Any = tuple(map(function, a, *others))
+    return entries
+
+
+def add(a: V, b: V) -> V:
     """Return the sum of two vectors."""
-    return plus(a[0], b[0]), plus(a[1], b[1]), plus(a[2], b[2])
+    return each(plus, a, b)
 
 
-def sub(a: Vec, b: Vec) -> Vec:
+def sub(a: V, b: V) -> V:
     """Return the difference of two vectors."""
-    return minus(a[0], b[0]), minus(a[1], b[1]), minus(a[2], b[2])
+    return each(minus, a, b)
 
 
-def scale(s: Number, a: Vec) -> Vec:
+def scale(s: Number, a: V) -> V:
     """Return a multiple of a vector."""
-    return mul(s, a[0]), mul(s, a[1]), mul(s, a[2])
+    return each(partial(mul, s), a)
 
 
 def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
@@ -58,7 +67,7 @@ def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
     return reduce(plus, map(mul, a, b))
 
 
-def cross(a: Vec, b: Vec) -> Vec:
+def cross(a: Sequence[Number], b: Sequence[Number]) -> Vec:
     """Return the cross product."""
     return (
         minus(mul(a[1], b[2]), mul(a[2], b[1])),
@@ -77,16 +86,33 @@ def norm(a: Sequence[Number], least: float = 1e-12) -> Number:
     return jnp.sqrt(jnp.maximum(dot(a, a), least * least))
 
 
-def turned(turn: tuple[Number, Number], a: Sequence[Number]) -> tuple[Number, Number]:
+def turned(by: Point, a: V) -> V:
     """Rotate x and y of a vector by an angle, given by its cosine and sine."""
-    (c, s), (x, y) = turn, a[:2]
-    return c * x - s * y, s * x + c * y
+    (c, s), (x, y, *rest) = by, a
+    entries: Any = c * x - s * y, s * x + c * y, *rest
+    return entries
 
 
-def turned_back(turn: tuple[Number, Number], a: Sequence[Number]) -> tuple[Number, Number]:
+def turned_back(by: Point, a: V) -> V:
     """Rotate x and y of a vector by minus an angle, given by its cosine and sine."""
-    (c, s), (x, y) = turn, a[:2]
-    return c * x + s * y, c * y - s * x
+    (c, s), (x, y, *rest) = by, a
+    entries: Any = c * x + s * y, c * y - s * x, *rest
+    return entries
+
+
+def turn(yaw: Number) -> Point:
+    """Return the cosine and sine of an angle [rad]."""
+    return jnp.cos(yaw), jnp.sin(yaw)
+
+
+def at_point(twist: Sequence[Number], arm: Sequence[Number]) -> Point:
+    """Return the planar velocity of the point at an arm from the origin of a twist."""
+    return twist[0] - twist[2] * arm[1], twist[1] + twist[2] * arm[0]
+
+
+def wrench(arm: Point, force: Sequence[Number]) -> Vec:
+    """Return a force at an arm from the origin as x, y and torque about the origin."""
+    return force[0], force[1], minus(mul(arm[0], force[1]), mul(arm[1], force[0]))
 
 
 def to_world(m: Sequence[Vec], a: Vec) -> Vec:

@@ -73,6 +73,7 @@ class GraphBuilder(Target):
     """Target that builds the graph of a function; equal nodes are shared."""
 
     max_products: int  # multiplications in one product of matrices
+    loops = For, While
 
     def __init__(self) -> None:
         self._ids = itertools.count()
@@ -205,13 +206,7 @@ class GraphBuilder(Target):
 
     # --- loops ---
 
-    def for_loop(self, body: Body, carry: Values, length: int) -> list[Value]:
-        return self._loop(For(length), None, body, carry)
-
-    def while_loop(self, condition: Body, body: Body, carry: Values) -> list[Value]:
-        return self._loop(While(), condition, body, carry)
-
-    def _loop(
+    def loop(
         self, op: For | While, condition: Body | None, body: Body, carry: Values
     ) -> list[Value]:
         carried, current = list[Node](), list[Value]()

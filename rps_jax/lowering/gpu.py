@@ -219,20 +219,17 @@ class GpuWriter(SimdWriter):
         assert self._is_scalar(node), f"{node.name} is not in shared memory"
         return f"of_thread_{node.kind}({node.name}, {index})"
 
-    def _broadcast(self, node: Node, index: int) -> str:
-        """Return an element at a constant index, in all threads."""
-        if node.width == 1 or node.storage in self._shared:
-            return self.item(node, index)
-        key = node.id, index
-        if key not in self._broadcasts:
-            name = self._broadcasts[key] = f"p{next(self._names)}"
-            self._pending.append(f"const {TYPES[node.kind]} {name} = {self.item(node, index)};")
-        return self._broadcasts[key]
-
     def read(self, a: Value, size: int, fused: Collection[Node] = ()) -> str:
         if isinstance(a, Array) and a.node.width > 1 and a.node not in fused:
-            if not a.step or size == 1:
-                return self._broadcast(a.node, a.first)
+            if not a.step or size == 1:  # an element in all threads
+                text = self.item(a.node, a.first)
+                if a.node.storage in self._shared:
+                    return text
+                key = a.node.id, a.first
+                if key not in self._broadcasts:
+                    name = self._broadcasts[key] = f"p{next(self._names)}"
+                    self._pending.append(f"const {TYPES[a.node.kind]} {name} = {text};")
+                return self._broadcasts[key]
             if a.covers(size):
                 return self.element(a.node)
         return super().read(a, size, fused)

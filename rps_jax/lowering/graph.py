@@ -76,6 +76,7 @@ class Target:
 
     operations: Collection[str] = ()  # that it spells; others are compounds
     kinds = "fib"  # kinds of numbers that it supports, see `kind_of`
+    loops: Any = ()  # kinds of loops that it supports; a `For` is unrolled otherwise
 
     # --- what each back end implements ---
 
@@ -87,13 +88,11 @@ class Target:
         """Apply a primitive; `out` is the type of the result."""
         raise NotImplementedError
 
-    def for_loop(self, body: Body, carry: Values, length: int) -> list[Value] | None:
-        """Emit a loop of `length` iterations; None: the loop is unrolled."""
-        return None
-
-    def while_loop(self, condition: Body, body: Body, carry: Values) -> list[Value]:
-        """Emit a loop that runs while its condition holds."""
-        raise UnsupportedError("while")
+    def loop(
+        self, op: For | While, condition: Body | None, body: Body, carry: Values
+    ) -> list[Value]:
+        """Emit a loop that it supports; a `While` runs while its condition holds."""
+        raise NotImplementedError
 
 
 def size_of(shape: Sequence[int]) -> int:

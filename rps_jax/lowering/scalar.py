@@ -18,6 +18,7 @@ from rps_jax.lowering.graph import (
     Call,
     Carried,
     DynamicSlice,
+    For,
     If,
     Input,
     LoopNode,
@@ -25,7 +26,6 @@ from rps_jax.lowering.graph import (
     MatrixProduct,
     Node,
     Reduce,
-    Target,
     Value,
     flat,
     gathered_scalar,
@@ -60,7 +60,7 @@ class ScalarBuilder(GraphBuilder):
         return scalar
 
     # The printed code may have a deadline, so the length of each loop must be known.
-    while_loop = Target.while_loop
+    loops = (For,)
 
     def products(self, matrix: Factor, rows: Factor, dtype: np.dtype) -> list[Value]:
         (weights, indices), (value, row_indices) = matrix, rows

@@ -21,6 +21,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from rps_jax.lowering.compounds import COMPOUNDS, Function, fill_of
 from rps_jax.lowering.graph import (
     Body,
+    For,
     Params,
     Shape,
     Target,
@@ -28,6 +29,7 @@ from rps_jax.lowering.graph import (
     UnsupportedError,
     Value,
     Values,
+    While,
     is_constant,
     kind_of,
     operation_of,
@@ -140,7 +142,9 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Values:
         second = first + params["body_nconsts"]
         condition = _with_consts(params["cond_jaxpr"], values[:first], target)
         body = _with_consts(params["body_jaxpr"], values[first:second], target)
-        return target.while_loop(condition, body, values[second:])
+        if While not in target.loops:
+            raise UnsupportedError("while")
+        return target.loop(While(), condition, body, values[second:])
     inner = params.get("call_jaxpr", params.get("jaxpr"))
     if inner is not None:
         return _walk(inner, values, target)
@@ -320,9 +324,8 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
     fixed, carried = _counts(eqn)
     consts, carry = values[:fixed], values[fixed : fixed + carried]
     if len(values) == fixed + carried == fixed + len(body.out_avals):
-        loop = target.for_loop(_with_consts(body, consts, target), carry, length)
-        if loop is not None:
-            return loop
+        if For in target.loops:
+            return target.loop(For(length), None, _with_consts(body, consts, target), carry)
     elif _count_equations(body) > _MAX_UNROLLED:
         counts = {"length": length, "fixed": fixed, "carried": carried}
         function = functools.partial(_scan_loop, jaxpr=body, reverse=params["reverse"], **counts)

@@ -447,7 +447,7 @@ def _entries(path: Path, topics: Collection[str]) -> Iterator[tuple[str, str, in
 
 def _reason(error: Exception) -> str:
     """Return what an error of a reader says, in one line."""
-    return " ".join(str(error).split())[:300].rstrip(".") or type(error).__name__
+    return errors.one_line(error)[:300].rstrip(".") or type(error).__name__
 
 
 def _collect(

@@ -25,7 +25,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from rps_jax.errors import InputError, require
+from rps_jax.errors import InputError, one_line, require
 
 FileKind = Literal["json", "yaml", "image", "python", "xml", "policy", "table", "part", "results"]
 _MAX_PART = 2**33  # [bytes]
@@ -57,7 +57,7 @@ class CorruptFileError(InputError):
     """A file, or another source, whose content cannot be decoded."""
 
     def __init__(self, source: object, reason: object) -> None:
-        text = " ".join(str(reason).split()).rstrip(".")
+        text = one_line(reason).rstrip(".")
         super().__init__(
             f"{source} is corrupt ({text}): restore it, or delete it and run the same command "
             "again."
@@ -212,7 +212,7 @@ def read_fields(path: Path) -> JsonObject:
         try:
             fields = _named_values(yaml.YAML(typ="safe", pure=True).load(content))
         except Exception as error:  # of any kind: the file is no mapping
-            reason = " ".join(str(error).split())
+            reason = one_line(error)
             raise InputError(f"{path} is no YAML mapping ({reason}): write name: value.") from error
     image = {"image": str(path.parent / str(fields["image"]))} if "image" in fields else {}
     return fields | image

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from rps_jax.errors import InputError, check_name
+from rps_jax.errors import InputError, check_name, one_line
 from rps_jax.record import files
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
@@ -52,7 +52,7 @@ def read(path: Path, name: str, unit_of: Callable[[str], str | None]) -> pd.Data
     try:
         cells = pd.read_csv(io.StringIO(text), header=None, dtype=str, **options)
     except ValueError as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise InputError(f"{name} is no table ({reason}): write CSV with a header.") from error
     columns = dict[str, pd.Series]()
     titles = [str(title) for title in cells.iloc[0]]

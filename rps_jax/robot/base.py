@@ -32,8 +32,8 @@ from jax.typing import DTypeLike
 
 from rps_jax import spec
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Number, Pair
-from rps_jax.geometry.vectors import Vec, turned
+from rps_jax.geometry.arrays import Array, Number, Pair, Scalar
+from rps_jax.geometry.vectors import Point, Vec, sub, turned, turned_back
 from rps_jax.robot.robot import Robot
 from rps_jax.spec import Spec
 
@@ -78,10 +78,15 @@ def observe_pose(
     if not poses.shape[0]:
         return poses, pose
     poses = jnp.concatenate([pose[None], poses[:-1]])
-    delayed = poses[_steps_of(odometry.pose_latency, period)]
+    delayed = poses[steps_of(odometry.pose_latency, period)]
     noise = jax.random.fold_in(jax.random.fold_in(key, _ODOMETRY), steps)
     sigma = jnp.stack([odometry.pose_noise] * 2 + [odometry.yaw_noise])
     return poses, delayed + sigma * normal(noise, (3,), pose.dtype)
+
+
+def low_pass(old: Array, new: Array, period: Scalar, time_constant: Number) -> Array:
+    """Return the output of a filter of first order, after a `period` [s] at the input `new`."""
+    return old + (1 - jnp.exp(-period / time_constant)) * (new - old)
 
 
 def normal(key: Array, shape: tuple[int, ...], dtype: DTypeLike) -> Array:
@@ -89,14 +94,8 @@ def normal(key: Array, shape: tuple[int, ...], dtype: DTypeLike) -> Array:
     return jax.random.normal(key, shape, jnp.float32).astype(dtype)
 
 
-def delay_twist(odometry: Odometry, twists: Array, twist: Array, period: float) -> Pair:
-    """Return the latest commanded twists (K, 3), `twist` (3,) first, and the delayed one (3,)."""
-    twists = jnp.concatenate([twist[None], twists[:-1]])
-    delayed = twists[_steps_of(odometry.command_delay, period)]
-    return twists, delayed
-
-
-def _steps_of(time: Number, period: float) -> Array:
+def steps_of(time: Number, period: float) -> Array:
+    """Return the number of control steps of `period` [s] in a time [s]."""
     return jnp.round(time / period).astype(jnp.int32)
 
 
@@ -127,7 +126,7 @@ class LoadCell(NamedTuple):
         noise = jax.random.fold_in(jax.random.fold_in(key, _FORCE), steps)
         signal = load.signal
         raw = load.wrench[:2] + self.noise * normal(noise, (2,), signal.dtype)
-        signal = signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - signal)
+        signal = low_pass(signal, raw, period, self.time_constant)
         above = jnp.sum(signal * signal) >= self.threshold**2
         return load._replace(signal=signal), jnp.where(above, signal, 0.0)
 
@@ -150,7 +149,7 @@ def init_load(template: Array) -> Load:
 # --- the drive -----------------------------------------------------------------------------
 
 STALLED = 0.1  # [1] share of the executed speed below which a base stands still
-_STALL = 1.0  # [s] of standing still after which a base has stalled
+STALL = 1.0  # [s] of standing still after which a base has stalled
 _MOVING = 1e-3  # [m/s] executed speed above which a base can stall
 GRIP = 1e3  # [1] mass of a base sideways, over its own mass
 
@@ -184,8 +183,7 @@ def aim(robot: Robot, previous: Array, twist: Array, period: float) -> Array:
     if robot.omega_max is not None:
         twist = twist.at[2].set(jnp.clip(twist[2], -robot.omega_max, robot.omega_max))
     if robot.lag is not None:
-        share = 1 - jnp.exp(-period / jnp.maximum(robot.lag, 1e-9))
-        twist = previous + share * (twist - previous)
+        twist = low_pass(previous, twist, period, jnp.maximum(robot.lag, 1e-9))
     if robot.acceleration_max is not None:
         linear, turning = jnp.asarray(robot.acceleration_max) * period
         change = twist - previous
@@ -211,7 +209,7 @@ def _aim_axle(robot: Robot, previous: Array, twist: Array, period: float) -> Arr
     old, motion = jnp.stack([previous[0], previous[2]]), _steered(robot, twist[0], twist[2])
     motion = scaled(motion, v_max, robot.omega_max, robot.wheel_speed_max)
     if robot.lag is not None:
-        motion = old + (1 - jnp.exp(-period / jnp.maximum(robot.lag, 1e-9))) * (motion - old)
+        motion = low_pass(old, motion, period, jnp.maximum(robot.lag, 1e-9))
     bounds = (None, None) if robot.acceleration_max is None else robot.acceleration_max
     limits = *bounds, robot.wheel_acceleration_max
     steps = (None if x is None else x * period for x in limits)
@@ -254,7 +252,7 @@ def push(
     integral: Vec,  # [N, N, N m] of the servo, in the base's frame
     twist: Vec,  # [m/s, m/s, rad/s] aimed, in the base's frame
     velocity: Vec,  # [m/s, m/s, rad/s] of the base, in the world's frame
-    turn: tuple[Number, Number],  # cosine and sine of the base's heading
+    turn: Point,  # cosine and sine of the base's heading
     timestep: float,  # [s] of the physics
     xp: ModuleType = jnp,  # or numpy, for numbers on the host
 ) -> tuple[Vec, Vec]:
@@ -264,31 +262,27 @@ def push(
       Force and torque [N, N, N m] of the drive on the base, in the world's frame; and the integral
       after the step.
     """
-    c, s = turn
-    errors = (
-        twist[0] - (c * velocity[0] + s * velocity[1]),
-        twist[1] - (c * velocity[1] - s * velocity[0]),
-        twist[2] - velocity[2],
-    )
+    errors = sub(twist, turned_back(turn, velocity))
     inertia = (robot.mass, robot.mass, robot.inertia)
     if robot.drive != "omni":
         errors = _axle_errors(robot, twist, errors, xp)
         inertia = (robot.mass, robot.mass, robot.inertia + robot.mass * robot.axle_behind**2)
     rate = 2 * math.pi * robot.bandwidth  # [rad/s], critically damped
     demand = [m * 2 * rate * e + i for m, e, i in zip(inertia, errors, integral, strict=True)]
-    output = list(demand)
+    ahead, left, torque = demand
     if (limit := robot.push_max) is not None:
-        square = demand[0] * demand[0] + demand[1] * demand[1]
+        square = ahead * ahead + left * left
         size = xp.sqrt(xp.maximum(square, 1e-18))  # the square root of 0 has no derivative
         share = xp.minimum(1.0, limit / size)
-        output[:2] = demand[0] * share, demand[1] * share
+        ahead, left = ahead * share, left * share
     if (limit := robot.turn_max) is not None:
-        output[2] = xp.minimum(xp.maximum(demand[2], -limit), limit)
+        torque = xp.minimum(xp.maximum(torque, -limit), limit)
+    output = ahead, left, torque
     x, y, z = (
         i + timestep * (m * rate**2 * e + rate * (u - d))  # anti-windup: u - d is the cut-off part
         for i, m, e, u, d in zip(integral, inertia, errors, output, demand, strict=True)
     )
-    return (*turned(turn, output), output[2]), (x, y, z)
+    return turned(turn, output), (x, y, z)
 
 
 def _axle_errors(robot: Robot, twist: Vec, errors: Vec, xp: ModuleType) -> Vec:
@@ -296,11 +290,12 @@ def _axle_errors(robot: Robot, twist: Vec, errors: Vec, xp: ModuleType) -> Vec:
 
     A car that is slower than its aim turns less, with the same curvature.
     """
-    if robot.turning_radius is None:
-        return errors[0], 0.0 * errors[1], errors[2]
-    speed = xp.where(xp.abs(twist[0]) < 1e-9, 1e-9, twist[0])
-    share = xp.clip(1 - errors[0] / speed, 0.0, 1.0)
-    return errors[0], 0.0 * errors[1], errors[2] - (1 - share) * twist[2]
+    ahead, left, turn = errors
+    if robot.turning_radius is not None:
+        speed = xp.where(xp.abs(twist[0]) < 1e-9, 1e-9, twist[0])
+        share = xp.clip(1 - ahead / speed, 0.0, 1.0)
+        turn = turn - (1 - share) * twist[2]
+    return ahead, 0.0 * left, turn
 
 
 class Tyres(NamedTuple):
@@ -311,7 +306,7 @@ class Tyres(NamedTuple):
     rest: Number  # () [m/s^2] that leaves no sideways velocity after the step
 
     @classmethod
-    def of(cls, robot: Robot, velocity: Vec, turn: tuple[Number, Number], dt: float) -> Tyres:
+    def of(cls, robot: Robot, velocity: Vec, turn: Point, dt: float) -> Tyres:
         """Return the tyres of a base with a `velocity` in the world, for a step of `dt` [s].
 
         `turn` has the cosine and sine of the heading at the start of the step.
@@ -340,8 +335,3 @@ def count_stalled_steps(robot: Robot, drive: Drive, qvel: Array) -> Drive:
     speed = planar.norm(apply_slip(robot, drive.aim)[:2])
     stands = (planar.norm(qvel[:2]) < STALLED * speed) & (speed > _MOVING)
     return drive._replace(stalled=jnp.where(stands, drive.stalled + 1, 0))
-
-
-def has_stalled(drive: Drive | None, period: float) -> Array | bool:
-    """Whether () a base has stood still for `_STALL`; `period` [s] is the control period."""
-    return False if drive is None else drive.stalled * period >= _STALL

@@ -38,7 +38,7 @@ from rps_jax.geometry.arrays import (
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import parse_changes
-from rps_jax.robot.base import normal
+from rps_jax.robot.base import low_pass, normal
 from rps_jax.robot.shell import HALF_WIDTH, Shell, side_lengths
 from rps_jax.spec import Named, Spec
 
@@ -199,7 +199,7 @@ class CapacitiveSkin(NamedTuple):
         return state._replace(key=key), state.gain * change + noise
 
     def _filtered(self, state: SkinState, raw: Array, period: Scalar) -> SkinState:
-        signal = state.signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - state.signal)
+        signal = low_pass(state.signal, raw, period, self.time_constant)
         return state._replace(signal=signal)
 
     def read(

@@ -167,7 +167,7 @@ def candidates(law: Any) -> LawParams:
         return stack([law])
     if isinstance(law, list) or type(law) is tuple:
         return stack(law)
-    example = next((p for p in registry.LAWS.values() if type(p) is type(law)), None)
+    example = registry.preset_of(law)
     leaves = zip(*map(jax.tree.leaves, (law, example)), strict=True)
     is_single = example is not None and all(np.ndim(x) == np.ndim(y) for x, y in leaves)
     return stack([law]) if is_single else law

@@ -52,7 +52,7 @@ from rps_jax.record import cache, files, folder, manifest, options, provenance
 from rps_jax.record.bag import TopicsLike
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
-from rps_jax.robot.robot import RobotLike, parse_robot
+from rps_jax.robot.robot import Robot, RobotLike, parse_robot
 from rps_jax.runs.run import Run
 from rps_jax.trials.case import suited_laws
 from rps_jax.trials.progress import Bar, ProgressCallback, is_interactive
@@ -446,11 +446,6 @@ class SimulationQuestion(TrialQuestion[T]):
     def _robot_and_task(self) -> tuple[RobotLike | None, Task | None]:
         return getattr(self, "robot", None), None
 
-    def suited_laws(self, laws: Sequence[str]) -> Sequence[str]:
-        """Return those of some laws that suit robot and task, or another law that does."""
-        robot, task = self._robot_and_task
-        return laws if robot is None else suited_laws(parse_robot(robot), task, laws)
-
     def next_command(self, command: str, **values: object) -> str:
         """Return a command of the shell with values, and with robot, task and physics of this."""
         same = {name: getattr(self, name, None) for name in ("robot", "task")}
@@ -513,7 +508,7 @@ class TaskOption:
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("robot", "task")
 
     @property
-    def _robot_and_task(self) -> tuple[RobotLike, Task]:
+    def _robot_and_task(self) -> tuple[Robot, Task]:
         domain: Any = getattr(self, "domain", "wide")
         first = next(iter(domain), "wide") if isinstance(domain, tuple | list) else domain
         ranges = domains.parse_domain(first, self.robot, self.task)

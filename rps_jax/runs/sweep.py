@@ -87,7 +87,13 @@ def describe_plan(plan: Plan) -> str:
 
 def plan_sections(plan: Plan, results: xr.Dataset, folder: Path | None) -> list[Section]:
     """Return sections on rates, differences, what success depends on, and the hardest worlds."""
-    sections = [success_section(results, float(plan.setting.rules.max_lost))]
+    text = (
+        "CVaR: mean over the worst 5 % of worlds of the least distance between contact point "
+        "and target; of an object that was never touched, the whole distance. "
+        f"{statistics.NOT_PROMISED}"
+    )
+    rows = tables.success_table(results, float(plan.setting.rules.max_lost))
+    sections = [Section("Success", text, rows)]
     if results.sizes["law"] > 1:
         rows = tables.difference_table(results)
         text = "Differences of success, with 95 % intervals for paired worlds."
@@ -107,16 +113,6 @@ def plan_sections(plan: Plan, results: xr.Dataset, folder: Path | None) -> list[
     hardest = statistics.hardest(results)
     rows = tables.worlds_table(results, "RUN" if folder is None else str(folder), hardest)
     return [*sections, Section("The hardest worlds", text, rows)]
-
-
-def success_section(results: xr.Dataset, max_lost: float) -> Section:
-    """Return the section on the success of each law."""
-    text = (
-        "CVaR: mean over the worst 5 % of worlds of the least distance between contact point "
-        "and target; of an object that was never touched, the whole distance. "
-        f"{statistics.NOT_PROMISED}"
-    )
-    return Section("Success", text, tables.success_table(results, max_lost))
 
 
 @dataclass(frozen=True, kw_only=True)

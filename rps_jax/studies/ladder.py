@@ -26,6 +26,7 @@ from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, 
 from rps_jax.record.files import JsonObject
 from rps_jax.runs.question import Rows, TaskOption
 from rps_jax.runs.sweep import Sweep, SweepOptions, describe_plan
+from rps_jax.trials.case import suited_laws
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.worlds import DomainLike
 
@@ -89,7 +90,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     def chosen(self) -> dict[str, LawParams]:
         if not isinstance(self.laws, tuple) or self.laws:
             return registry.resolve_laws(self.laws)
-        return registry.resolve_laws(self.suited_laws(all_laws()))
+        return registry.resolve_laws(suited_laws(*self._robot_and_task, all_laws()))
 
     @cached_property
     def sweeps(self) -> dict[str, _TestSweep]:
@@ -203,7 +204,7 @@ class Score(Ladder, _ScoredLaw):
     def chosen(self) -> dict[str, LawParams]:
         label, params = resolve_law(self.law)
         scored = {label: registry.check_params(params)}
-        others = self.laws or self.suited_laws(("rps", "rps_plus"))
+        others = self.laws or suited_laws(*self._robot_and_task, ("rps", "rps_plus"))
         return scored | registry.resolve_laws(others) | scored
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:

@@ -18,7 +18,7 @@ from rps_jax.record import files
 from rps_jax.runs.push import case_options
 from rps_jax.runs.question import DefaultLaws
 from rps_jax.trials import pushes
-from rps_jax.trials.case import FrictionLike, TrialOptions, label_of
+from rps_jax.trials.case import FrictionLike, TrialOptions
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS, STORED
@@ -76,7 +76,9 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
         """Run all cases, and return their outcomes."""
         outcome, _ = pushes.run(self.cases, self.setting, **run.batch_options)
         objects = [Path(x).stem if files.suffix_of(x) == ".xml" else x for x in self.objects]
-        frictions = [label_of(friction) for friction in self.friction]
+        frictions = [
+            x if isinstance(x, str) else ",".join(map("{:g}".format, x)) for x in self.friction
+        ]
         return outcome_dataset(outcome, list(self.chosen), objects, frictions, self.targets)
 
     def intro(self, results: xr.Dataset) -> str:

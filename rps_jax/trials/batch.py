@@ -35,7 +35,7 @@ import threading
 import time
 import warnings
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, Protocol, Unpack
@@ -108,7 +108,7 @@ def run_batch(
     groups: dict[Hashable, list[tuple[int, Iterable[WorldBatch]]]] = {}
     for request, first in zip(requests, _first_trials(requests), strict=False):
         for program, count, batches in request.jobs(setting):
-            groups.setdefault(program, []).append((count, _shifted(batches, first)))
+            groups.setdefault(program, []).append((count, map(partial(_shifted, first), batches)))
     jobs = []
     for program, group in groups.items():
         counts, batches = zip(*group, strict=True)
@@ -117,10 +117,9 @@ def run_batch(
     return run(jobs, setting, collect=collect, **options)
 
 
-def _shifted(batches: Iterable[WorldBatch], first: int) -> Iterator[WorldBatch]:
-    """Yield batches with indices of trials that count from `first`."""
-    for batch in batches:
-        yield batch._replace(indices=first + batch.indices)
+def _shifted(first: int, batch: WorldBatch) -> WorldBatch:
+    """Return a batch with indices of trials that count from `first`."""
+    return batch._replace(indices=first + batch.indices)
 
 
 def outcomes(
@@ -432,7 +431,7 @@ class _Program:
         return jax.tree.map(shape, self.queues[index].shapes)
 
 
-_Advance = Callable[..., tuple[tuple[Trial, ...], tuple[SegmentState, ...]]]
+_Advance = Callable[..., trial.Advanced]
 _Ended = tuple[np.ndarray, Outcome, float]  # indices of trials, outcomes, and [s] that all advanced
 
 

@@ -171,8 +171,3 @@ def friction_of(friction: FrictionLike) -> Friction:
         for name, value in zip(("ground", "robot"), values, strict=True)
     )
     return Friction(ground, robot)
-
-
-def label_of(friction: FrictionLike) -> str:
-    """Return the name of a friction set, or its coefficients as a text."""
-    return friction if isinstance(friction, str) else ",".join(f"{value:g}" for value in friction)

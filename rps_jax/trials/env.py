@@ -42,7 +42,7 @@ from rps_jax.trials.worlds import WorldBatch, drawn_scene, drawn_worlds, rows, s
 from rps_jax.world import domain, draws, video
 from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 from rps_jax.world.draws import Draw
-from rps_jax.world.scene import JOINTS, Scene
+from rps_jax.world.scene import JOINTS
 from rps_jax.world.tasks import TaskLike
 from rps_jax.world.tasks.base import heading_of, is_relative
 
@@ -326,9 +326,6 @@ class PushEnv:
         worlds = soften_skins(part.worlds) if self.smooth else part.worlds
         return part._replace(worlds=jax.tree.map(jnp.asarray, worlds))
 
-    def _scene(self, index: int) -> Scene:
-        return drawn_scene(self._alone, self._drawn, self.setting.physics, index)
-
     def render(
         self,
         trajectory: State | Sequence[State],
@@ -350,9 +347,14 @@ class PushEnv:
             world: World = jax.device_get(shown[0].info["world"])
             poses, size = [np.asarray(s.data.qpos) for s in shown], (width, height)
             view, lines = camera or "oblique", world.task.lines()
-            inputs = self._scene(index), poses
+            scene = drawn_scene(self._alone, self._drawn, self.setting.physics, index)
             images += video.images(
-                *inputs, p_world_target=world.p_world_target, lines=lines, size=size, camera=view
+                scene,
+                poses,
+                p_world_target=world.p_world_target,
+                lines=lines,
+                size=size,
+                camera=view,
             )
         return images
 

@@ -18,8 +18,7 @@ import numpy as np
 from rps_jax import engines, errors
 from rps_jax.control.base import LawParams, Memory
 from rps_jax.geometry.arrays import Array
-from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot.skin import CapacitiveSkin, Skin
+from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials import trial
 from rps_jax.trials.batch import stepper
 from rps_jax.trials.setting import Setting
@@ -187,15 +186,10 @@ def _observe(
     """Return snapshot, contact point and compression of a world in several states."""
     snapshot = trial.decide(world, params, trials, loop)[2]
     contact = trial.p_world_contact(rows(snapshot, None))[0]
-    return snapshot, contact, _compression(world.skin, trial.outline(world, snapshot.qpos))
-
-
-def _compression(skin: Skin, outline: Footprint) -> Array:
-    """Return the greatest compression (T,) [1] under each taxel.
-
-    The tolerance of an ideal sensor counts as its foam.
-    """
+    skin = world.skin
+    # The tolerance of an ideal sensor counts as its foam.
     thickness = skin.foam if isinstance(skin, CapacitiveSkin) else skin.tolerance
     foam = jnp.maximum(thickness, 1e-6)
-    compression = CapacitiveSkin(foam=foam, shell=skin.shell).compression(outline)
-    return jnp.max(jnp.stack(compression), axis=0) / foam
+    taxels = CapacitiveSkin(foam=foam, shell=skin.shell)
+    compression = taxels.compression(trial.outline(world, snapshot.qpos))
+    return snapshot, contact, jnp.max(jnp.stack(compression), axis=0) / foam

@@ -24,7 +24,7 @@ from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Trial, World
-from rps_jax.trials.worlds import WorldBatch, drawn_worlds, soften_skins
+from rps_jax.trials.worlds import WorldBatch, drawn_worlds, rows, soften_skins
 from rps_jax.world import draws
 from rps_jax.world.domain import DomainLike, parse_domain
 from rps_jax.world.tasks import TaskLike
@@ -143,8 +143,8 @@ def rollout(
     first = fresh if start is None else _resumed(start, fresh)
     inputs = jax.tree.map(lambda x: jnp.asarray(x)[None], (world, params, first))
     last, snapshots = trial.unroll(stage, *inputs, loop=loop, steps=steps, mapped=native.mapped)
-    snapshots = jax.tree.map(lambda x: x[:, 0], snapshots)
-    return (snapshots, jax.tree.map(lambda x: x[0], last)) if return_state else snapshots
+    snapshots = rows(snapshots, np.s_[:, 0])
+    return (snapshots, rows(last, 0)) if return_state else snapshots
 
 
 def _resumed(start: Trial, fresh: Trial) -> Trial:
@@ -158,8 +158,7 @@ def _resumed(start: Trial, fresh: Trial) -> Trial:
 
 def _check_scalars(params: LawParams) -> None:
     """Raise InputError for parameters that are no numbers, or arrays where the law has scalars."""
-    presets = (x for x in registry.LAWS.values() if type(x) is type(params))
-    known = named_leaves(next(presets, params))
+    known = named_leaves(registry.preset_of(params) or params)
     for name, leaf in named_leaves(params).items():
         if np.shape(leaf) and not np.shape(known.get(name, leaf)):
             rule = "give one number, and map over several by jax.vmap"

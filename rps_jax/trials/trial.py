@@ -359,7 +359,8 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     Both twists are in the robot frame; `period` [s] is the control period.
     """
     if trial.twists.shape[0]:
-        twists, delayed = base.delay_twist(world.odometry, trial.twists, jnp.stack(twist), period)
+        twists = jnp.concatenate([jnp.stack(twist)[None], trial.twists[:-1]])
+        delayed = twists[base.steps_of(world.odometry.command_delay, period)]
         delayed = base.apply_errors(world.robot, delayed, world.odometry.velocity_error)
         trial, twist = trial._replace(twists=twists), Twist(*delayed)
     if world.robot is None or trial.drive is None:
@@ -564,6 +565,7 @@ def outcome(trial: Trial, worlds: World, loop: ControlLoop) -> Outcome:
     is_lost = (trial.contact_steps == 0) | (trial.lost_steps * period > loop.rules.max_lost)
     position, yaw = jax.vmap(object_pose)(trial.qpos.reshape(-1, 10))
     pose = jnp.concatenate([position, yaw[:, None]], axis=-1)
+    stalled = False if trial.drive is None else trial.drive.stalled * period >= base.STALL
     return Outcome(
         success=trial.success,
         time=trial.steps * period,
@@ -579,7 +581,7 @@ def outcome(trial: Trial, worlds: World, loop: ControlLoop) -> Outcome:
         tipped=trial.tipped,
         diverged=trial.diverged,
         nan_twist=trial.nan_twist,
-        stalled=base.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
+        stalled=stalled & ~trial.success & ~trial.diverged,
         unfelt=trial.done & is_lost & jax.vmap(is_pressed)(worlds, trial.qpos),
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
@@ -589,11 +591,11 @@ def outcome(trial: Trial, worlds: World, loop: ControlLoop) -> Outcome:
 
 @partial(jax.jit, static_argnames=("law",))
 def start_all(
-    worlds: World, params: LawParams, live: Bool[Array, " B"], law: Law = rps.LAW
+    worlds: World, params: LawParams, live: Bool[Array, " B"] | None = None, law: Law = rps.LAW
 ) -> Trial:
     """Return the trials of a batch of worlds before their start; those not `live` are padding."""
     trials = jax.vmap(partial(start, law=law))(worlds, params)
-    return trials._replace(done=~live)
+    return trials if live is None else trials._replace(done=~live)
 
 
 _UNCHECKED = 20  # control steps on a GPU before the host checks whether any trial runs
@@ -654,9 +656,10 @@ class SegmentState(NamedTuple):
     outcome: Outcome  # (B, ...)
 
 
-def segment_of(
-    physics: Physics, law: Law
-) -> Callable[..., tuple[tuple[Trial, ...], tuple[SegmentState, ...]]]:
+Advanced = tuple[tuple[Trial, ...], tuple[SegmentState, ...]]  # after a segment, by batch
+
+
+def segment_of(physics: Physics, law: Law) -> Callable[..., Advanced]:
     """Return a function that starts fresh trials of batches, and runs some control steps of all.
 
     Its arguments are stages, inputs and trials of the batches; masks (B,) of the trials that start
@@ -672,7 +675,7 @@ def segment_of(
         live: tuple[Array, ...],
         rules: Rules,
         steps: Array,
-    ) -> tuple[tuple[Trial, ...], tuple[SegmentState, ...]]:
+    ) -> Advanced:
         pairs = zip(inputs, live, strict=True)
         started = [start_all(*leaves, mask, law=law) for leaves, mask in pairs]
         current = tuple(map(jax.vmap(soft.tree_where), fresh, started, trials))
@@ -734,7 +737,7 @@ def run_on_host(
       Trials at the start and after each control step.
     """
     worlds, params = jax.device_put((worlds, params), jax.devices("cpu")[0])
-    trials = start_all(worlds, params, np.ones(len(worlds.qpos), bool), law=loop.law)
+    trials = start_all(worlds, params, law=loop.law)
     dtype, qpos = trials.qpos.dtype, np.asarray(trials.qpos, float)
     yield trials
     opened = engine.open_batch(stage, qpos, threads, pushing(worlds), worlds.fields)
@@ -744,7 +747,7 @@ def run_on_host(
             qpos, running = np.asarray(decided.qpos), np.flatnonzero(~np.asarray(decided.done))
             # Only a scripted shift moves the object outside of the engine.
             moved = np.flatnonzero(np.any(qpos != np.asarray(trials.qpos), axis=1))
-            batch.set_positions(moved, qpos[moved])
+            batch.qpos[moved] = qpos[moved]
             if running.size:
                 twists = np.stack(twist, axis=1)[running].astype(float)
                 batch.drive(running, twists, loop.physics.substeps)

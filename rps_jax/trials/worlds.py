@@ -282,11 +282,6 @@ class Candidates:
 
         for worlds in self.batches(setting):
             batches = [candidate(worlds, i) for i in range(num_candidates)]
-            program = _shape_key(batches[0].inputs)
+            leaves, structure = jax.tree.flatten(batches[0].inputs)
+            program = structure, *(np.shape(leaf)[1:] for leaf in leaves)
             yield Job(program, num_candidates * worlds.indices.size, batches)
-
-
-def _shape_key(tree: object) -> Hashable:
-    """Return the structure of a pytree and the shapes of its leaves without their first axis."""
-    leaves, structure = jax.tree.flatten(tree)
-    return structure, *(np.shape(leaf)[1:] for leaf in leaves)

@@ -465,7 +465,7 @@ def _value_and_slopes(
     def scores(leaves: Mapping[str, Leaf]) -> Scored:
         moved = registry.replace_leaves(inputs, leaves)
         worlds, params = moved["world"], moved["params"]
-        trials = trial.start_all(worlds, params, np.ones(len(worlds.qpos), bool), law=loop.law)
+        trials = trial.start_all(worlds, params, law=loop.law)
         if options.states and options.setting.simulator.computes_force and trials.load is None:
             trials = trials._replace(load=jax.vmap(base.init_load)(worlds.qpos))
         run = stage, worlds, params, trials, loop, options.steps, native.mapped, options.states

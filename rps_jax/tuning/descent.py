@@ -305,7 +305,7 @@ def _run_trials(
         (moved,) = trial.advance([batch], loop, round(options.window / period))
         return moved, (state, inputs, score(state, 1.0, 0.0), ~state.done)
 
-    first = trial.start_all(worlds, params, jnp.ones(len(worlds.qpos), bool), law=loop.law)
+    first = trial.start_all(worlds, params, law=loop.law)
     count = max(1, round(float(rules.horizon) / options.window))
     last, (states, inputs, scores, live) = jax.lax.scan(proceed, first, length=count)
     rest = score(last, 1.0 * last.success, jnp.minimum(last.min_distance, _FAR)) - scores

@@ -377,7 +377,7 @@ def _simulate_logs(
             columns["signal"] = jnp.where(trials.skin.alive, trials.skin.signal, 0.0)
         return trials, columns
 
-    trials = trial.start_all(worlds, params, jnp.ones(len(worlds.qpos), bool), law=loop.law)
+    trials = trial.start_all(worlds, params, law=loop.law)
     return jax.lax.scan(row, trials, length=rows)[1]
 
 

@@ -309,7 +309,7 @@ def _scatter(
     pose: np.ndarray, slope: np.ndarray, start: np.ndarray, covariance: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return the scatter (n,) of place [m] and turn [rad], of the model and the parameters."""
-    moved = np.linalg.norm(pose[:, :2] - start[:, :2], axis=1)
+    moved = _distance(pose, start)
     spread = np.einsum("nip,pq,niq->ni", slope, covariance, slope)
     # The scatter of the model grows with the motion of the object.
     size = {"place": moved, "turn": np.abs(pose[:, 2] - start[:, 2])}
@@ -320,10 +320,15 @@ def _scatter(
     }
 
 
+def _distance(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) [m] between poses (n, 3)."""
+    return np.linalg.norm(pose[:, :2] - other[:, :2], axis=1)
+
+
 def errors_of(pose: np.ndarray, end: np.ndarray) -> dict[str, np.ndarray]:
     """Return the errors (n,) of poses (n, 3): `place` [m] and `turn` [rad]."""
     turn = np.abs(solid.wrap(pose[:, 2] - end[:, 2]))
-    return {"place": np.linalg.norm(pose[:, :2] - end[:, :2], axis=1), "turn": turn}
+    return {"place": _distance(pose, end), "turn": turn}
 
 
 def _half_size(outline: np.ndarray) -> float:
@@ -344,7 +349,7 @@ def _check(corners: np.ndarray, data: Pushes, radius: float, prior: Mapping) -> 
         raise errors.not_allowed("pushes", f"push {i}", rule)
     turns = np.abs(data.end[:, 2] - data.start[:, 2])
     turns = np.where(turns < 2 * np.pi, np.abs(solid.wrap(turns)), turns) * _half_size(corners)
-    moved = np.linalg.norm(data.end[:, :2] - data.start[:, :2], axis=1)
+    moved = _distance(data.end, data.start)
     way = np.linalg.norm(np.diff(data.path, axis=1), axis=2).sum()
     for name, unit, motion in (("x and y", "m", moved), ("yaw", "rad", turns)):
         if (ratio := np.nansum(motion) / max(way, 1e-9)) > _CARRIED:
@@ -353,72 +358,6 @@ def _check(corners: np.ndarray, data: Pushes, radius: float, prior: Mapping) -> 
     if (gap := np.median(np.nan_to_num(np.abs(data.gaps(corners, radius, at_end=True))))) > _AWAY:
         rule = f"the finger is {gap:.3g} m away: give x, y, tip_x, tip_y in m and yaw in rad"
         raise errors.not_allowed("pushes", "without a contact at the end", rule)
-
-
-def fit(
-    outline: ArrayLike,
-    pushes: PushesLike,
-    radius: float,
-    prior: Mapping[str, tuple[float, float]] = PRIOR,
-    feet: ArrayLike | None = None,
-) -> ObjectFit:
-    """Fit an object to measured pushes: see `FitObject`."""
-    corners, data = finger.check_outline(outline), read_pushes(pushes)
-    _check(corners, data, radius, prior)
-    mean, deviation = np.array([*{**PRIOR, **prior}.values()]).T
-    pads = finger.uniform_pads(corners) if feet is None else _pads_of(feet)
-    fixed, size = _fixed(corners, pads, radius), _half_size(corners)
-    turn = size * solid.wrap(data.end[:, 2] - data.start[:, 2])
-    way = np.linalg.norm(data.end[:, :2] - data.start[:, :2], axis=1)
-    unit = _LOSS[0] + _LOSS[1] * np.nan_to_num(np.abs(np.stack([way, way, turn], axis=1)))
-
-    def residuals(z: np.ndarray) -> np.ndarray:
-        """Return robust residuals of poses and gaps, and those of the priors."""
-        pose, gap = _batched(_simulate, mean + deviation * z, fixed, data)
-        off = pose - data.end
-        off[:, 2] = size * solid.wrap(off[:, 2])
-        rows = np.append(off / unit, gap[:, :2].T / _GAP)
-        return np.append(np.nan_to_num(np.sign(rows) * np.sqrt(np.log1p(rows**2))), z)
-
-    def slopes(z: np.ndarray) -> np.ndarray:
-        x, robust = mean + deviation * z, residuals(z)[: -len(z)]
-        pose, gap = _batched(_derivatives, x, fixed, data)
-        pose = pose / unit[:, :, None] * np.array([1, 1, size])[:, None]
-        rows = np.concatenate([pose.reshape(-1, len(z)), *gap[:, :2].swapaxes(0, 1) / _GAP])
-        # Derivative of Cauchy's root loss g = sqrt(log(1 + r^2)), with r^2 = exp(g^2) - 1.
-        square = np.expm1(robust**2)
-        ratio = np.where(square > 1e-12, np.sqrt(square) / np.maximum(abs(robust), 1e-9), 1.0)
-        return np.concatenate([rows * (ratio / (1 + square))[:, None] * deviation, np.eye(len(z))])
-
-    derivatives: Any = slopes  # SciPy's types lack functions
-    start = np.zeros(len(mean))
-    best = least_squares(residuals, start, derivatives, max_nfev=40, ftol=1e-4, xtol=1e-3)
-    x = mean + deviation * best.x
-    gaps = _batched(_simulate, x, fixed, data)[1]
-    touches, gaps = gaps[:, 2] < _APART, gaps[:, 1]
-    if not touches.any():
-        raise errors.not_allowed("pushes", "without a contact at the end", "push the object")
-    gaps = np.where(touches, gaps, np.nan)
-    if np.nanmedian(np.abs(gaps)) > _MOST_GAP:
-        rule = (
-            "after the fit it is at most 0.5 mm if outline, units, finger and pushes are of one "
-            "object and the finger touches it at the end"
-        )
-        words = f"{1e3 * np.nanmedian(np.abs(gaps)):.2g} mm (median)"
-        raise errors.not_allowed("gap at the end of the pushes", words, rule)
-    j = slopes(best.x)
-    covariance = np.linalg.inv(j.T @ j)
-    covariance = deviation[:, None] * covariance * deviation
-    columns = {
-        "mean": ("parameter", x),
-        "deviation": ("parameter", np.sqrt(np.diag(covariance))),
-        "prior": (("parameter", "moment"), np.column_stack([mean, deviation])),
-        "covariance": (("parameter", "other"), covariance),
-        "gap": ("push", gaps),
-    }
-    data_set = xr.Dataset(columns, {"parameter": list(PRIOR)})
-    fitted = ObjectFit(data_set, corners, radius, _QUANTILE, pads)
-    return fitted if np.isnan(data.end).any() else _calibrated(fitted, data)
 
 
 def _traits(outline: np.ndarray, pushes: Pushes) -> np.ndarray:
@@ -509,7 +448,63 @@ class FitObject(Question[ObjectFit]):
         _check(*self._inputs, self.radius, self.prior or PRIOR)
 
     def answer(self, run: Run) -> ObjectFit:
-        return fit(*self._inputs, self.radius, self.prior or PRIOR, self.feet)
+        """Fit the object to the pushes."""
+        corners, data = self._inputs
+        mean, deviation = np.array([*{**PRIOR, **(self.prior or {})}.values()]).T
+        pads = finger.uniform_pads(corners) if self.feet is None else _pads_of(self.feet)
+        fixed, size = _fixed(corners, pads, self.radius), _half_size(corners)
+        turn = size * solid.wrap(data.end[:, 2] - data.start[:, 2])
+        way = _distance(data.end, data.start)
+        unit = _LOSS[0] + _LOSS[1] * np.nan_to_num(np.abs(np.stack([way, way, turn], axis=1)))
+
+        def residuals(z: np.ndarray) -> np.ndarray:
+            """Return robust residuals of poses and gaps, and those of the priors."""
+            pose, gap = _batched(_simulate, mean + deviation * z, fixed, data)
+            off = pose - data.end
+            off[:, 2] = size * solid.wrap(off[:, 2])
+            rows = np.append(off / unit, gap[:, :2].T / _GAP)
+            return np.append(np.nan_to_num(np.sign(rows) * np.sqrt(np.log1p(rows**2))), z)
+
+        def slopes(z: np.ndarray) -> np.ndarray:
+            x, robust = mean + deviation * z, residuals(z)[: -len(z)]
+            pose, gap = _batched(_derivatives, x, fixed, data)
+            pose = pose / unit[:, :, None] * np.array([1, 1, size])[:, None]
+            rows = np.concatenate([pose.reshape(-1, len(z)), *gap[:, :2].swapaxes(0, 1) / _GAP])
+            # Derivative of Cauchy's root loss g = sqrt(log(1 + r^2)), with r^2 = exp(g^2) - 1.
+            square = np.expm1(robust**2)
+            ratio = np.where(square > 1e-12, np.sqrt(square) / np.maximum(abs(robust), 1e-9), 1.0)
+            rows *= (ratio / (1 + square))[:, None]
+            return np.concatenate([rows * deviation, np.eye(len(z))])
+
+        derivatives: Any = slopes  # SciPy's types lack functions
+        start = np.zeros(len(mean))
+        best = least_squares(residuals, start, derivatives, max_nfev=40, ftol=1e-4, xtol=1e-3)
+        x = mean + deviation * best.x
+        gaps = _batched(_simulate, x, fixed, data)[1]
+        touches, gaps = gaps[:, 2] < _APART, gaps[:, 1]
+        if not touches.any():
+            raise errors.not_allowed("pushes", "without a contact at the end", "push the object")
+        gaps = np.where(touches, gaps, np.nan)
+        if np.nanmedian(np.abs(gaps)) > _MOST_GAP:
+            rule = (
+                "after the fit it is at most 0.5 mm if outline, units, finger and pushes are of "
+                "one object and the finger touches it at the end"
+            )
+            words = f"{1e3 * np.nanmedian(np.abs(gaps)):.2g} mm (median)"
+            raise errors.not_allowed("gap at the end of the pushes", words, rule)
+        j = slopes(best.x)
+        covariance = np.linalg.inv(j.T @ j)
+        covariance = deviation[:, None] * covariance * deviation
+        columns = {
+            "mean": ("parameter", x),
+            "deviation": ("parameter", np.sqrt(np.diag(covariance))),
+            "prior": (("parameter", "moment"), np.column_stack([mean, deviation])),
+            "covariance": (("parameter", "other"), covariance),
+            "gap": ("push", gaps),
+        }
+        data_set = xr.Dataset(columns, {"parameter": list(PRIOR)})
+        fitted = ObjectFit(data_set, corners, self.radius, _QUANTILE, pads)
+        return fitted if np.isnan(data.end).any() else _calibrated(fitted, data)
 
     def report(self, results: ObjectFit, run: Run) -> Sequence[Section]:
         data = results.data

@@ -103,7 +103,7 @@ class Space:
 
         The preset is the first of the law, which is the paper's for RPS. Arrays are lists.
         """
-        preset = next(p for p in registry.LAWS.values() if type(p) is type(self.base))
+        preset = registry.preset_of(self.base)
         both = map(registry.named_leaves, (self.params(vector), preset))
         values, defaults = ({k: _rounded(x) for k, x in leaves.items()} for leaves in both)
         return {n: x for n, x in values.items() if n in self.names or x != defaults[n]}

@@ -287,7 +287,7 @@ def _compiled(label: str, path: Path) -> mujoco.MjModel:
         spec = read(path)
         model = spec.compile()
     except ValueError as error:
-        reason = " ".join(str(error).split())
+        reason = errors.one_line(error)
         raise InputError(f"{label}: MuJoCo cannot compile {path} ({reason}).") from error
     for kind, elements in (("body", spec.bodies), ("joint", spec.joints), ("geom", spec.geoms)):
         if missing := sorted(set(_REQUIRED[kind]) - {element.name for element in elements}):

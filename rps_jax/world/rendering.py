@@ -22,6 +22,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from rps_jax import errors
 
@@ -190,8 +191,9 @@ class SceneRenderer:
         self.renderer._gl_context.make_current()
         self.mujoco.mjr_render(part, self.renderer.scene, self.renderer._mjr_context)
         self.mujoco.mjr_readPixels(drawn, None, part, self.renderer._mjr_context)
-        drawn = _averaged(drawn)[y - first[1] :, x - first[0] :][: end_y - y, : end_x - x]
-        self._image[::-1][y:end_y, x:end_x] = drawn  # OpenGL's rows go up
+        drawn = np.asarray(Image.fromarray(drawn).reduce(_FINER))[y - first[1] :, x - first[0] :]
+        # OpenGL's rows go up.
+        self._image[::-1][y:end_y, x:end_x] = drawn[: end_y - y, : end_x - x]
 
     def _points(self, marks: np.ndarray) -> np.ndarray:
         """Return points (m, 3) [m] around the moving bodies, the marks and their shadows."""
@@ -235,13 +237,6 @@ class SceneRenderer:
         self.mujoco.mjv_initGeom(geom, kind, size, position, np.eye(3).ravel(), colour)
         view.ngeom += 1
         return geom
-
-
-def _averaged(fine: np.ndarray) -> np.ndarray:
-    """Return the image (height, width, 3) of one that is `_FINER` times as fine."""
-    parts = (fine[i::_FINER, j::_FINER] for i in range(_FINER) for j in range(_FINER))
-    whole = functools.reduce(np.add, (part.astype(np.uint16) for part in parts))
-    return ((whole + _FINER**2 // 2) // _FINER**2).astype(np.uint8)
 
 
 @contextlib.contextmanager

@@ -191,8 +191,7 @@ def compile_solid(
     for name, size in geom_sizes(family, single).items():
         spec.geom(name).size[: size.size] = size
     if family == "prism":
-        distinct = np.any(single.vertices != np.roll(single.vertices, 1, axis=0), axis=1)
-        corners, half = single.vertices[distinct], single.height / 2
+        corners, half = single.vertices[solid.distinct(single.vertices)], single.height / 2
         faces = [np.column_stack([corners, np.full(len(corners), z)]) for z in (-half, half)]
         spec.mesh("prism").uservert = np.concatenate(faces).ravel()
     if single.feet is not None:

@@ -18,7 +18,6 @@ from rps_jax.analysis.figures.style import (
     WIDTH,
     Figure,
     base_patch,
-    base_sizes,
     legend_above,
     panel,
     shade,
@@ -113,7 +112,8 @@ def _object(trace: xr.Dataset, index: int) -> np.ndarray:
 def draw_path(ax: Axes, trace: xr.Dataset, snapshots: int = 7) -> None:
     """Draw a trial as a map: base, object and contact point, and snapshots from start to end."""
     pose, target = trace.qpos.values[:, :3], trace.p_world_target.values
-    sizes = base_sizes(trace)
+    names = ["base_radius"] if "base_radius" in trace else ["half_length", "half_width"]
+    sizes = [float(trace[name]) for name in names]
     ax.plot(*pose[:, :2].T, color=_BASE, label="base", zorder=3)
     ax.plot(*trace.p_world_contact.values.T, ".", ms=2, color="C0", label="contact point")
     ax.plot(*trace.qpos.values[:, 3:5].T, "--", lw=1, color=_OBJECT, label="object")

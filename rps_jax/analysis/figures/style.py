@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from matplotlib import cycler, figure, patches, rc_context, transforms
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable as ScalarMappable
@@ -14,6 +13,7 @@ from matplotlib.colors import TwoSlopeNorm as TwoSlopeNorm
 
 from rps_jax.analysis import statistics
 from rps_jax.geometry import solid
+from rps_jax.geometry.footprint import CORNERS
 from rps_jax.robot import shell
 from rps_jax.world.domain import LABELS
 
@@ -105,18 +105,12 @@ def base_patch(
     Its sizes are half length and width (2,) [m], or the radius (1,) [m]; a line shows the heading
     of a round base.
     """
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+    corners = CORNERS
     if len(sizes) == 1:
         corners = np.append(solid.unit(np.linspace(0, 2 * np.pi, 49)), [[0, 0]], axis=0)
     corners = corners * np.asarray(sizes)
     world = solid.rotate(pose[2], corners) + pose[:2]
     return patches.Polygon(world, facecolor="0.35" if fill else "none", edgecolor="0.35")
-
-
-def base_sizes(trace: xr.Dataset) -> list[float]:
-    """Return the sizes of the base of a trial over time, for `base_patch`."""
-    names = ["base_radius"] if "base_radius" in trace else ["half_length", "half_width"]
-    return [float(trace[name]) for name in names]
 
 
 def shade(ax: Axes, time: np.ndarray, active: np.ndarray, colour: str) -> None:

@@ -139,16 +139,6 @@ def _learn(params: APSParams, state: APSState, p_world_object: Array, a_OT: Arra
     )
 
 
-def _aim(params: APSParams, obs: PoseObservation) -> Array:
-    """Return the aim (2,) [m] beyond the target, on the line from the contact or the object."""
-    touch = obs.touch
-    of_contact = planar.direction(displacement(touch))
-    of_object = planar.direction(touch.p_world_target - obs.p_world_object)
-    angle = jnp.where(touch.in_contact, of_contact, of_object)
-    beyond = params.aim_beyond * obs.r_object
-    return touch.p_world_target + beyond * planar.unit(angle)
-
-
 def step(
     params: APSParams, state: APSState, obs: PoseObservation
 ) -> tuple[APSState, Twist, Details]:
@@ -158,7 +148,12 @@ def step(
     away that it approaches.
     """
     touch = obs.touch
-    to_target = _aim(params, obs) - obs.p_world_object
+    # The aim is beyond the target, on the line from the contact or the object.
+    of_contact = planar.direction(displacement(touch))
+    of_object = planar.direction(touch.p_world_target - obs.p_world_object)
+    angle = jnp.where(touch.in_contact, of_contact, of_object)
+    beyond = params.aim_beyond * obs.r_object
+    to_target = touch.p_world_target + beyond * planar.unit(angle) - obs.p_world_object
     from_object = touch.p_world_robot - obs.p_world_object
     a_OT = planar.direction(to_target)
     first = ~state.started
@@ -174,7 +169,7 @@ def step(
     correction = params.K1 * state.gamma_mean + params.K2 * state.gamma
     heading = heading - jnp.where(near, correction, 0.0) + a_OT - touch.yaw
 
-    yaw_error = planar.wrap(planar.direction(-from_object) - touch.yaw)
+    yaw_error = planar.bearing(-from_object, touch.yaw)
     rate = jnp.where(first, 0.0, planar.wrap(yaw_error - state.yaw_error) / touch.period)
     omega = params.K_p * yaw_error + params.K_d * rate
     speed = jnp.maximum(params.v_max / (1 + jnp.abs(state.gamma_mean)), params.v_min)

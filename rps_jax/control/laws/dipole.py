@@ -78,9 +78,9 @@ def step(
 
     to_aim = planar.direction(aim - p_world_object)
     from_object = touch.p_world_robot - p_world_object
-    theta = planar.wrap(planar.direction(from_object) - to_aim)
+    theta = planar.bearing(from_object, to_aim)
     heading = to_aim + 2 * theta - touch.yaw
-    error = planar.wrap(planar.direction(-from_object) - touch.yaw)
+    error = planar.bearing(-from_object, touch.yaw)
     v_x, v_y = params.v_max * jnp.cos(heading), params.v_max * jnp.sin(heading)
     twist = Twist(v_x, v_y, params.K_h * error).saturate(params.v_max, params.omega_max)
     return DipoleState(start, jnp.ones_like(state.started)), twist, Details.from_obs(touch)

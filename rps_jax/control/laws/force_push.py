@@ -30,7 +30,15 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SuccessDistance, bounds_of
+from rps_jax.control.base import (
+    ApproachSpeed,
+    LastContact,
+    Law,
+    OmegaMax,
+    SuccessDistance,
+    Touched,
+    bounds_of,
+)
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Parameter, Pytree, Scalar
@@ -79,8 +87,8 @@ class Path(NamedTuple):
 
     p_world_start: Annotated[Array, Spec("m", "start of the path")]  # (2,)
     theta_d: Annotated[Array, Spec("rad", "direction of the path in the world")]  # ()
-    p_robot_contact: Annotated[Array, Spec("m", "the last contact")]  # (2,)
-    touched: Annotated[Array, Spec("1", "whether there was a contact")]  # () bool
+    p_robot_contact: LastContact
+    touched: Touched
 
     @classmethod
     def initial(cls, dtype: jax.typing.DTypeLike) -> Path:

@@ -101,7 +101,7 @@ def step(
     f_world = -planar.rotate(touch.yaw, obs.f_robot)  # on the object
     in_contact = planar.norm(f_world) >= params.f_min
     pushed = path.touched & (state.pushed | in_contact)
-    theta_f = planar.wrap(planar.direction(f_world) - path.theta_d)
+    theta_f = planar.bearing(f_world, path.theta_d)
     limit = params.converge * touch.period
     theta_p = force_push.steer(params, state.theta_p, theta_f, offset, limit, in_contact)
     theta_p = jnp.where(pushed, theta_p, 0.0)

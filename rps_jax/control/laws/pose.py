@@ -65,14 +65,17 @@ from rps_jax import spec
 from rps_jax.control import soft
 from rps_jax.control.base import (
     ApproachSpeed,
+    LastContact,
     Law,
     Memory,
     OmegaMax,
     SpeedMax,
     SuccessDistance,
+    TimeLost,
+    Touched,
     bounds_of,
 )
-from rps_jax.control.box import FLUSH, Box, extents, feel, turned, unknown_box
+from rps_jax.control.box import FLUSH, Box, extents, feel, turned
 from rps_jax.control.laws.unicycle import MODES, contact_of, turn_around
 from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
 from rps_jax.geometry import planar, solid
@@ -168,14 +171,14 @@ class PoseState(NamedTuple):
     h: Annotated[Array, Spec("m", "supports of the box in the grid, Q1 to Q3")]  # (4,)
     known: Annotated[Array, Spec("1", "whether each is known")]  # (4,) bool
     centred: Annotated[Array, Spec("1", "whether the middle of each axis was felt")]  # (2,)
-    p_world_contact: Annotated[Array, Spec("m", "the last contact")]  # (2,)
+    p_world_contact: LastContact
     p_world_front: Annotated[Array, Spec("m", "middle of the front, a step before")]  # (2,)
     p_world_base: Annotated[Array, Spec("m", "filtered position of the base")]  # (2,)
     yaw: Annotated[Array, Spec("rad", "filtered heading of the base")]
     twist: Annotated[Array, Spec("m/s, m/s, rad/s", "last command")]  # (3,)
-    touched: Annotated[Array, Spec("1", "whether there was a contact")]
+    touched: Touched
     time: Annotated[Array, Spec("s", "time since the start")]
-    t_lost: Annotated[Array, Spec("s", "time since the last contact")]
+    t_lost: TimeLost
     t_push: Annotated[Array, Spec("s", "time in contact of this push; 0 in an approach")]
     t_even: Annotated[Array, Spec("s", "time of even contact; negative: of uneven contact")]
     look: Annotated[Array, Spec("m", "Q9, position of the base to the left, in the leg")]
@@ -288,7 +291,8 @@ def step(
     # Where the end of the front is dead, only the side feels the object.
     forgets = (first | (pushing & touches & ~on_front)) & ~jnp.any(state.known)
     forgets |= is_uneven & (obs.ends[0] - obs.ends[1] < _NARROW)
-    square = unknown_box(grid @ (middle - goal) + params.r)
+    no = jnp.zeros(4, bool)
+    square = Box(grid @ (middle - goal) + params.r, no, no[:2])
     h, known, centred = soft.tree_where(forgets, square, soft.tree_where(feels, felt, box))
 
     h = jnp.where(touches & ~known, jnp.maximum(h, grid @ (p_world_contact - goal)), h)

@@ -56,14 +56,14 @@ def step(
     """
     contact = jnp.where(obs.in_contact, obs.p_robot_contact, 0.0)
     d = displacement(obs._replace(p_robot_contact=contact))
-    error = planar.wrap(planar.direction(d) - obs.yaw)
+    error = planar.bearing(d, obs.yaw)
     speed = jnp.minimum(params.K_v * planar.norm(d), params.v_max)
     v_contact = speed * jnp.stack([jnp.maximum(jnp.cos(error), params.press), jnp.sin(error)])
     omega = jnp.clip(params.K_h * error, -params.omega_max, params.omega_max)
     push = Twist.from_point_velocity(contact, v_contact, omega)
     push = push.saturate(params.v_max, params.omega_max)
     ahead = Twist(params.v_approach, 0.0, 0.0)
-    twist = jax.tree.map(lambda a, b: jnp.where(obs.in_contact, a, b), push, ahead)
+    twist = jax.tree.map(partial(jnp.where, obs.in_contact), push, ahead)
     details = Details.from_obs(obs._replace(p_robot_contact=contact))
     return state, twist, details._replace(gamma=error)
 

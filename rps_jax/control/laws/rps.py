@@ -249,7 +249,7 @@ def steering_angle(params: RPSParams, d: Float[Array, "*B 2"], yaw: PerWorld) ->
     The heading error is wrapped to [-pi, pi). The paper's tangent changes sign beyond pi / 2,
     where the robot would turn away from its target. Gamma is therefore clipped to +-gamma_max.
     """
-    gamma = params.K_h * planar.wrap(planar.direction(d) - yaw)
+    gamma = params.K_h * planar.bearing(d, yaw)
     return jnp.clip(gamma, -jnp.asarray(params.gamma_max), params.gamma_max)
 
 

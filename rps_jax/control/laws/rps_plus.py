@@ -34,7 +34,7 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import Law, bounds_of, nested_bounds
+from rps_jax.control.base import LastContact, Law, bounds_of, nested_bounds
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.observation import Details, Observation, Twist, displacement
@@ -87,7 +87,7 @@ class RPSPlusState(NamedTuple):
     """State of RPS+ between two control steps."""
 
     law: RPSState
-    p_world_contact: Annotated[Array, Spec("m", "the last contact")]  # (2,)
+    p_world_contact: LastContact
     steps_lost: Annotated[
         Array, Spec("1", "control steps since then; a float in the smooth law")
     ]  # () int32
@@ -111,7 +111,7 @@ def init(params: RPSPlusParams, temperatures: Temperatures | None = None) -> RPS
 
 def translation(params: RPSPlusParams, d: Array, yaw: Scalar) -> Twist:
     """Compute P2: the twist that moves the contact straight along d (2,) [m] in the world."""
-    error = planar.wrap(planar.direction(d) - yaw)
+    error = planar.bearing(d, yaw)
     speed = params.law.K_v * planar.norm(d)
     forward = jnp.maximum(jnp.cos(error), params.press)
     omega = jnp.zeros_like(error)

@@ -119,7 +119,7 @@ def step(
 
     heading = planar.direction(jnp.where(approach, middle, way.aim) - base)
     heading = jnp.where(clear | approach, heading, planar.direction(offset)) - yaw
-    face = planar.wrap(planar.direction(-offset) - yaw)
+    face = planar.bearing(-offset, yaw)
     limits = params.law.law
     v_max, omega_max = jnp.asarray(limits.v_max), jnp.asarray(limits.omega_max)
     v = v_max * planar.unit(heading)

@@ -50,7 +50,16 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import ApproachSpeed, Law, Memory, OmegaMax, SuccessDistance, bounds_of
+from rps_jax.control.base import (
+    ApproachSpeed,
+    Law,
+    Memory,
+    OmegaMax,
+    SuccessDistance,
+    TimeLost,
+    Touched,
+    bounds_of,
+)
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Number, Parameter
@@ -132,8 +141,8 @@ class UnicycleState(NamedTuple):
     p_world_object: Annotated[Array, Spec("m", "M, middle of the object")]  # (2,)
     p_world_contact: Annotated[Array, Spec("m", "C, the last contact")]  # (2,)
     l: Annotated[Array, Spec("m", "contact offset at C")]  # noqa: E741
-    touched: Annotated[Array, Spec("1", "whether there was a contact")]
-    t_lost: Annotated[Array, Spec("s", "time since the last contact")]
+    touched: Touched
+    t_lost: TimeLost
     pushed: Annotated[Array, Spec("1", "whether this push had a contact; 0 in an approach")]
     side: Annotated[Array, Spec("1", "1: counter-clockwise around M; -1: clockwise")]
     misses: Annotated[Array, Spec("1", "approaches since the last contact that missed")]
@@ -229,11 +238,6 @@ def _either(*conditions: Array) -> Array:
     return reduce(lambda a, b: a | b if a.dtype == b.dtype == bool else a + b, conditions)
 
 
-def _is(condition: Array) -> Array:
-    """Return a condition as a bool."""
-    return condition if condition.dtype == bool else condition > 0.5
-
-
 def step(
     params: UnicycleParams,
     state: UnicycleState,
@@ -277,7 +281,7 @@ def step(
 
     # D2 and D3.
     d = displacement(sensed)
-    distance, e = planar.norm(d), planar.wrap(planar.direction(d) - yaw)
+    distance, e = planar.norm(d), planar.bearing(d, yaw)
     psi = push_direction(middle, p_world_axle, obs.p_world_target, params.r)
 
     # The end of a push.
@@ -290,7 +294,8 @@ def step(
     is_finished = and_(and_(push, touched), or_(or_(and_(touches, spent), is_lost), missed))
 
     # D6: the side is chosen before the base leaves, and kept on the way.
-    offset, chooses = p_world_axle - middle, _is(or_(push, state.retreat))
+    offset, chooses = p_world_axle - middle, or_(push, state.retreat)
+    chooses = chooses if chooses.dtype == bool else chooses > 0.5
     radii = params.R + axle, params.R_s + axle
     circle = middle, psi, offset, state.side, chooses, *radii, params.carrot
     side, is_direct, staging, aim = way_around(*circle, angle)
@@ -320,7 +325,7 @@ def step(
     far = params.K_e * e + params.K_l * (l - jnp.clip(l, -params.l_dead, params.l_dead))
     arm = jnp.maximum(contact[0], _LEAST_ARM) + axle
     steer = where(near, params.K_near * v_max * jnp.sin(e) / arm, far)
-    approach = planar.wrap(planar.direction(middle - p_world_axle) - yaw)
+    approach = planar.bearing(middle - p_world_axle, yaw)
     steer = where(touches, steer, where(and_(is_new, touched), approach, 0.0))
     on_spot = 0.0 if least is None else -v_max
     is_large = above(jnp.abs(error), _LARGE, angle)

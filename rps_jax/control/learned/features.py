@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rps_jax.control.base import LastContact, TimeLost, Touched
 from rps_jax.control.observation import (
     EndsObservation,
     Observation,
@@ -69,9 +70,9 @@ OBSERVATIONS = {"taxels": taxel_observation, "ends": ends_observation}
 class TouchState(NamedTuple):
     """Record of touch, with positions by odometry."""
 
-    p_world_contact: Annotated[Array, Spec("m", "the last contact")]  # (2,)
-    touched: Annotated[Array, Spec("1", "whether there was a contact")]  # () bool
-    time_since_contact: Annotated[Array, Spec("s", "time since the last contact")]  # ()
+    p_world_contact: LastContact
+    touched: Touched
+    time_since_contact: TimeLost
     in_contact: Annotated[
         Array, Spec("1", "whether there is a contact in this control step")
     ]  # () bool

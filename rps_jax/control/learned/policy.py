@@ -66,7 +66,7 @@ def decode(content: bytes, source: Path | str) -> Policy:
         }
         return Policy(network, arrays, LearnedParams(**task), dict(about["learned"]))
     except (ValueError, KeyError, TypeError) as error:
-        reason = " ".join(str(error).split()).strip("'\".")
+        reason = errors.one_line(error).strip("'\".")
         rule = "give a file that `rps learn` wrote"
         raise errors.not_allowed("policy", f"{source} ({reason})", rule) from error
 

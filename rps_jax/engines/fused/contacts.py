@@ -9,6 +9,7 @@ Reference: MuJoCo documentation, "Computation: Constraint model".
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Array, Entries, Number
-from rps_jax.geometry.vectors import Vec
+from rps_jax.geometry.vectors import Point, Vec
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import WALL_HALF, WALL_TOP
 
@@ -65,8 +66,8 @@ class Corners(NamedTuple):
     @classmethod
     def of(cls, at: Vec) -> Corners:
         """Return the corners of points (N, ...), counter-clockwise seen from above."""
-        back = tuple(x - jnp.roll(x, 1, axis=0) for x in at)
-        ahead = tuple(jnp.roll(x, -1, axis=0) for x in at)
+        back = sp.each(lambda x: x - jnp.roll(x, 1, axis=0), at)
+        ahead = sp.each(lambda x: jnp.roll(x, -1, axis=0), at)
         return cls(at, ahead, sp.dot(back, back) > 1e-12)  # type: ignore[arg-type]
 
 
@@ -110,7 +111,7 @@ class Contact(NamedTuple):
     friction: Number  # [1]
     # [m] of a pad, which has a fourth row: the torque of friction about n over the radius
     radius: Number | None = None
-    arm: tuple[Number, Number] | None = None  # [m] from the origin of a base that can be slowed
+    arm: Point | None = None  # [m] from the origin of a base that can be slowed
 
 
 def _stiff(distance: Number, exists: Array | bool, impedance: Number, invweight: Number) -> Number:
@@ -183,18 +184,14 @@ def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Array]:
 def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Physics) -> Contact:
     """Return the contacts of the object's side with the base, at the lower and upper edge."""
     k, b = _stiffness(physics.base_solref, _D_MAX, physics.timestep)
-    turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    turn = sp.turn(state.base[2])
     z, normal, q, distance = side_contacts(body, state, m, turn)
     n = *sp.turned(turn, normal), 0.0
     t = (-n[1], n[0], 0.0)
     arm = sp.turned(turn, q)  # from the base's origin
-    lever = (state.base[0] + arm[0] - state.p[0], state.base[1] + arm[1] - state.p[1])
-    r = (*lever, z - state.p[2])
-    if state.driven is None:
-        v, w = sp.turned(turn, twist), twist[2]
-    else:
-        *v, w = state.driven.v
-    of_base = (v[0] - w * arm[1], v[1] + w * arm[0], 0.0)
+    r = (*sp.sub(sp.add(state.base[:2], arm), state.p[:2]), z - state.p[2])
+    velocity = sp.turned(turn, twist) if state.driven is None else state.driven.v
+    of_base = (*sp.at_point(velocity, arm), 0.0)
     u = sp.sub(sp.add(state.v, sp.cross(sp.to_world(m, state.w), r)), of_base)
     x = jnp.minimum(jnp.abs(distance) / _WIDTH, 1.0)
     x = jnp.where(x < 0.5, 2 * x * x, 1 - 2 * (1 - x) * (1 - x))
@@ -203,9 +200,6 @@ def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Phy
     bias = _bias(k, b, impedance, distance, (sp.dot(n, u), sp.dot(t, u), u[2]))
     held = state.driven is None
     return Contact(r, n, t, sp.Z, bias, d, body.friction_robot, arm=None if held else arm)
-
-
-Point = tuple[Number, Number]
 
 
 class Wall(NamedTuple):
@@ -227,7 +221,7 @@ def nearest_walls(ends: Entries, p: Vec, q: Sequence[Number], corners: Vec) -> l
     x, y, end_x, end_y = ends
     along, away = (end_x - x, end_y - y), (p[0] - x, p[1] - y)
     share = jnp.clip(sp.dot(away, along) / sp.dot(along, along), 0.0, 1.0)
-    away = (away[0] - share * along[0], away[1] - share * along[1])
+    away = sp.sub(away, sp.scale(share, along))
     gap = sp.norm(away)
     outline: Any = sp.to_world(sp.matrix(q), corners)[:2]
     inward = sp.least(sp.dot([c[:, None] for c in outline], [a[None] for a in away]))
@@ -284,8 +278,7 @@ def side_contacts(
         """
         middle, face = in_base((0.0, 0.0, 0.0)), sp.dot(body.up, feet)
         face = sp.greatest(face) if isinstance(body.vertices, Corners) else face
-        surface = (point[0] + depth * normal[0], point[1] + depth * normal[1])
-        away = (surface[0] - middle[0], surface[1] - middle[1])
+        away = sp.sub(sp.add(point, sp.scale(depth, normal)), middle[:2])
         above = up[2] * (sp.dot(slope, away) + z - middle[2]) - face
         rise = jnp.clip(-above * up[2], 0.0, high - z)
         return z + rise, normal, point, distance + sp.dot(slope, normal) * rise
@@ -297,7 +290,7 @@ def side_contacts(
         # A horizontal section of a leaning cylinder is an ellipse, wider along the normal.
         lean = sp.dot(slope, normal)
         wider = body.radius * (jnp.sqrt(1 + lean * lean) - 1)
-        point = (point[0] - 0.5 * wider * normal[0], point[1] - 0.5 * wider * normal[1])
+        point = sp.sub(point, sp.scale(0.5 * wider, normal))
         distance = distance - wider
         return on_object(z, normal, point, distance, 0.5 * distance)
     middle = 0.5 * (low + high)
@@ -307,11 +300,11 @@ def side_contacts(
     i = _index(2 * count, middle + 0 * normal[0])
     first = i % count == 0
     z = jnp.where(i < count, low, high)
-    point = tuple(jnp.where(first, points[0][k], points[-1][k]) for k in range(2))
+    point = sp.each(partial(jnp.where, first), points[0], points[-1])
     gap = jnp.where(first, distances[0], distances[-1])
     distance = gap + sp.dot(slope, normal) * (z - middle)
     # The point is midway at the middle height.
-    return on_object(z, normal, point, distance, distance - 0.5 * gap)  # type: ignore[arg-type]
+    return on_object(z, normal, point, distance, distance - 0.5 * gap)
 
 
 def circle_and_base(
@@ -321,20 +314,18 @@ def circle_and_base(
     if len(size) == 1:
         normal, _, distance = circle_and_base(centre, radius, (0.0, 0.0))
         return _on_circle(size[0], normal, distance - size[0])
-    nearest = tuple(jnp.clip(x, -h, h) for x, h in zip(centre, size, strict=True))
-    offset = (centre[0] - nearest[0], centre[1] - nearest[1])
+    nearest = sp.each(lambda x, h: jnp.clip(x, -h, h), centre, size)
+    offset = sp.sub(centre, nearest)
     gap = sp.norm(offset)
     outside = gap > 1e-6
     normal = (jnp.where(outside, offset[0] / gap, 1.0), jnp.where(outside, offset[1] / gap, 0.0))
     distance = jnp.where(outside, gap, centre[0] - size[0]) - radius
-    point = (nearest[0] + 0.5 * distance * normal[0], nearest[1] + 0.5 * distance * normal[1])
-    return normal, point, distance
+    return normal, sp.add(nearest, sp.scale(0.5 * distance, normal)), distance
 
 
 def _on_circle(radius: Number, normal: Point, distance: Number) -> tuple[Point, Point, Number]:
     """Return normal, point and distance [m] of a contact of a round base."""
-    away = radius + 0.5 * distance
-    return normal, (away * normal[0], away * normal[1]), distance
+    return normal, sp.scale(radius + 0.5 * distance, normal), distance
 
 
 def polygon_and_base(
@@ -348,9 +339,9 @@ def polygon_and_base(
     reference face, as in MuJoCo's box-box collider.
     """
     x, y = corners
-    along = (ahead[0] - x, ahead[1] - y)
+    along = sp.sub(ahead, corners)
     length = sp.norm(along)
-    along = (along[0] / length, along[1] / length)
+    along = sp.each(lambda x: x / length, along)
     n = (along[1], -along[0])
     real = length > 1e-6
     if len(size) == 1:
@@ -375,32 +366,28 @@ def polygon_and_base(
         for row, value in zip(sides[1:], score[1:], strict=True):
             better = value > top
             top = jnp.where(better, value, top)
-            picked = jax.tree.map(lambda new, old, w=better: jnp.where(w, new, old), row, picked)
+            picked = jax.tree.map(partial(jnp.where, better), row, picked)
         return picked
 
     of_base = side([s[0] for s in sides])
     by_base = of_base[0] + _PARALLEL > separation
-    ref, start, direction, width = jax.tree.map(
-        lambda u, v: jnp.where(by_base, u, v), of_base[1:], chosen
-    )
+    ref, start, direction, width = jax.tree.map(partial(jnp.where, by_base), of_base[1:], chosen)
     base_edge = side([-sp.dot(s[1], ref) for s in sides])[2:]
     _, object_edge = _best(jnp.where(real, -sp.dot(n, ref), -_FAR), faces)
-    p, edge, extent = jax.tree.map(
-        lambda u, v: jnp.where(by_base, u, v), object_edge[1:], base_edge
-    )
+    p, edge, extent = jax.tree.map(partial(jnp.where, by_base), object_edge[1:], base_edge)
     # Clip the incident edge p + t edge, t in [0, extent], to [0, width] of the reference face.
-    offset = (p[0] - start[0]) * direction[0] + (p[1] - start[1]) * direction[1]
+    offset = sp.dot(sp.sub(p, start), direction)
     pace = sp.dot(edge, direction)  # near -1
     pace = jnp.where(jnp.abs(pace) < 1e-3, -1e-3, pace)
     limits = [-offset / pace, (width - offset) / pace]
     low = jnp.clip(jnp.minimum(*limits), 0.0, extent)
     high = jnp.clip(jnp.maximum(*limits), 0.0, extent)
-    normal = (jnp.where(by_base, ref[0], -ref[0]), jnp.where(by_base, ref[1], -ref[1]))
+    normal = sp.each(lambda x: jnp.where(by_base, x, -x), ref)
     points, distances = [], []
     for t in (low, high):
-        q = (p[0] + t * edge[0], p[1] + t * edge[1])
-        distance = (q[0] - start[0]) * ref[0] + (q[1] - start[1]) * ref[1]
-        points.append((q[0] - 0.5 * distance * ref[0], q[1] - 0.5 * distance * ref[1]))
+        q = sp.add(p, sp.scale(t, edge))
+        distance = sp.dot(sp.sub(q, start), ref)
+        points.append(sp.sub(q, sp.scale(0.5 * distance, ref)))
         distances.append(distance)
     return normal, points, distances
 
@@ -414,14 +401,13 @@ def _polygon_and_circle(
     normals, directions, lengths [m], and whether they are real.
     """
     n, along, length, real = edges
-    x, y = corners
     s = jnp.clip(-sp.dot(corners, along), 0.0, length)
-    q = (x + s * along[0], y + s * along[1])
+    q = sp.add(corners, sp.scale(s, along))
     level = -sp.dot(corners, n)  # of the middle above each edge, negative inside
     inside = sp.greatest(jnp.where(real, level, -_FAR)) < 0
     _, (q, n) = _best(jnp.where(real, -sp.dot(q, q), -_FAR), (q, n))
     gap = sp.norm(q)
-    normal = (jnp.where(inside, -n[0], q[0] / gap), jnp.where(inside, -n[1], q[1] / gap))
+    normal = sp.each(lambda x, y: jnp.where(inside, -x, y / gap), n, q)
     normal, point, distance = _on_circle(radius, normal, jnp.where(inside, -gap, gap) - radius)
     return normal, [point], [distance]
 

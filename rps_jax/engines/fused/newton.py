@@ -12,6 +12,7 @@ Reference: MuJoCo documentation, "Computation: Constraint model" and "Solver".
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
 from typing import Any, NamedTuple
@@ -69,7 +70,7 @@ def contact_force(contact: Contact, x: Row, physics: Physics) -> tuple[Row, Row]
         stuck += [d_t, *(0.0 for _ in way[i + 1 :])]
     sticking = (-d * x[0], *(-d_t * y for y in x[1:])), tuple(stuck)
     sliding = force, tuple(stiffness)
-    return jax.tree.map(lambda a, b: jnp.where(sticks, a, b), sticking, sliding)
+    return jax.tree.map(partial(jnp.where, sticks), sticking, sliding)
 
 
 def _pyramid(contact: Contact, x: Row, physics: Physics) -> tuple[Row, Row]:
@@ -108,8 +109,7 @@ def _rows(contact: Contact, x: Sequence[Vec]) -> Row:
     a, alpha, *base = x
     u = sp.add(a, sp.cross(alpha, contact.r))
     if base and contact.arm is not None:
-        (b_x, b_y, turn), (arm_x, arm_y) = *base, contact.arm
-        u = sp.sub(u, (b_x - turn * arm_y, b_y + turn * arm_x, 0.0))
+        u = sp.sub(u, (*sp.at_point(base[0], contact.arm), 0.0))
     rows = sp.dot(contact.n, u), sp.dot(contact.t, u), sp.dot(contact.s, u)
     if contact.radius is None:
         return rows
@@ -118,7 +118,7 @@ def _rows(contact: Contact, x: Sequence[Vec]) -> Row:
 
 def _at(contact: Contact, x: Sequence[Vec]) -> Row:
     """Return J a - a_ref of a contact."""
-    return tuple(map(sp.plus, _rows(contact, x), contact.bias))
+    return sp.add(_rows(contact, x), contact.bias)
 
 
 def _solve(h: list[list[Number]], g: Sequence[Number]) -> list[Number]:
@@ -157,11 +157,15 @@ class Problem(NamedTuple):
     ) -> Problem:
         """Return the problem of a state; `m` are the rows of the rotation of its principal axes."""
         i, w = body.inertia, state.w
-        torque = sp.cross((i[0] * w[0], i[1] * w[1], i[2] * w[2]), w)  # - w x (I w)
-        free = sp.to_world(m, (torque[0] / i[0], torque[1] / i[1], torque[2] / i[2]))
+        torque = sp.cross(sp.each(sp.mul, i, w), w)  # - w x (I w)
+        free = sp.to_world(m, sp.each(operator.truediv, torque, i))
         start = state.accelerations
         lift = (0.0, 0.0, GRAVITY) if body.gravity is None else sp.scale(-1, body.gravity)
-        return cls(body.mass, _spin(body, m), free, contacts, base, start, lift)
+        spin: Any = [
+            tuple(sum(m[r][k] * m[c][k] * i[k] for k in range(3)) for c in range(3))
+            for r in range(3)
+        ]
+        return cls(body.mass, spin, free, contacts, base, start, lift)
 
     def gauss(self, x: Sequence[Vec]) -> list[Vec]:
         """Return M (x - free accelerations)."""
@@ -169,7 +173,7 @@ class Problem(NamedTuple):
         linear = sp.scale(self.mass, sp.add(a, self.lift))
         angular = sp.to_world(self.spin, sp.sub(alpha, self.free))
         inertia, force, tyres = self.base
-        rows = [sp.sub(_times(inertia, y), force) for y in b]
+        rows = [sp.sub(sp.each(sp.mul, inertia, y), force) for y in b]
         if tyres is not None:
             excess = sp.dot(tyres.sideways, b[0]) - tyres.rest
             rows = [sp.add(rows[0], tyres.along(tyres.mass * excess))]
@@ -196,9 +200,9 @@ class Problem(NamedTuple):
             torque = sp.cross(c.r, f)
             if c.radius is not None:
                 torque = sp.add(torque, sp.scale(c.radius * force[3], c.n))
-            g[:2] = sp.sub(g[0], _sums(f)), sp.sub(g[1], _sums(torque))
+            g[:2] = sp.sub(g[0], sp.each(sp.total, f)), sp.sub(g[1], sp.each(sp.total, torque))
             if c.arm is not None:
-                g[2] = sp.add(g[2], _sums(_on_base(c.arm, f)))
+                g[2] = sp.add(g[2], sp.each(sp.total, sp.wrench(c.arm, f)))
             _stiffen(h, c, k)
         return [entry for block in g for entry in block], h
 
@@ -274,7 +278,7 @@ def _minimise(problem: Problem, physics: Physics) -> list[Vec]:
         slope = reduce(sp.plus, map(sp.dot, problem.gauss(x), d))
         bend = mass * sp.dot(d[0], d[0]) + sp.dot(d[1], sp.to_world(problem.spin, d[1]))
         for e in d[2:]:
-            bend = bend + sp.dot(base.inertia, _times(e, e))
+            bend = bend + sp.dot(base.inertia, sp.each(sp.mul, e, e))
             if base.tyres is not None:
                 bend = bend + base.tyres.mass * sp.dot(base.tyres.sideways, e) ** 2
         lines = [(c, _at(c, x), _rows(c, d)) for c in problem.contacts]
@@ -297,18 +301,8 @@ def _minimise(problem: Problem, physics: Physics) -> list[Vec]:
     )[1]
 
 
-def _times(a: Vec, b: Vec) -> Vec:
-    """Return the products of entries."""
-    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
-
-
-def _on_base(arm: tuple[Number, Number], f: Vec) -> Vec:
-    """Return a force at an arm from the base's origin as x, y and torque about the origin."""
-    return f[0], f[1], sp.minus(sp.mul(arm[0], f[1]), sp.mul(arm[1], f[0]))
-
-
 def wrench_on_base(
-    contact: Contact, arm: tuple[Number, Number], x: Sequence[Vec], turn: Point, physics: Physics
+    contact: Contact, arm: Point, x: Sequence[Vec], turn: Point, physics: Physics
 ) -> Vec:
     """Return the wrench of the object on the base [N, N, N m], about its origin, in its frame.
 
@@ -320,26 +314,14 @@ def wrench_on_base(
       physics: with the friction cone.
     """
     force, _ = contact_force(contact, _at(contact, x), physics)
-    f_x, f_y, torque = _sums(_on_base(arm, sp.combine(force, (contact.n, contact.t, contact.s))))
-    ahead, left = sp.turned_back(turn, (f_x, f_y))
-    return -ahead, -left, -torque  # the contacts' force is on the object
-
-
-def _sums(vector: Vec) -> Vec:
-    return sp.total(vector[0]), sp.total(vector[1]), sp.total(vector[2])
+    wrenches = sp.wrench(arm, sp.combine(force, (contact.n, contact.t, contact.s)))
+    wrench = sp.turned_back(turn, sp.each(sp.total, wrenches))
+    return sp.each(lambda x: -x, wrench)  # the contacts' force is on the object
 
 
 def _any(active: Array) -> Array:
     """Whether any entry is above zero."""
     return jnp.sum(active) > 0
-
-
-def _spin(body: Body, m: Sequence[Vec]) -> list[Vec]:
-    """Return the inertia tensor in the world's axes."""
-    i = body.inertia
-    return [
-        tuple(sum(m[r][k] * m[c][k] * i[k] for k in range(3)) for c in range(3)) for r in range(3)
-    ]  # type: ignore[return-value]
 
 
 def _stiffen(h: list[list[Number]], c: Contact, k: Row) -> None:
@@ -366,20 +348,20 @@ def _stiffen(h: list[list[Number]], c: Contact, k: Row) -> None:
             h[i][j] = sp.plus(h[i][j], sp.total(columns[j][i]))
         for j in range(3):
             h[3 + i][j] = sp.plus(h[3 + i][j], sp.total(turned[j][i]))
-        row = sp.cross(c.r, (turned[0][i], turned[1][i], turned[2][i]))
+        row = sp.cross(c.r, [column[i] for column in turned])
         for j in range(i + 1):
             h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], sp.total(row[j]))
     if c.arm is None:
         return
     # The base's rows: -B^T K (1, [r]^T, -B), where B maps the motion of its origin to the point's.
-    onto = [_on_base(c.arm, column) for column in columns]
+    onto = [sp.wrench(c.arm, column) for column in columns]
     for j in range(3):
-        twisted = _on_base(c.arm, (turned[0][j], turned[1][j], turned[2][j]))
+        twisted = sp.wrench(c.arm, [column[j] for column in turned])
         for i in range(3):
             h[6 + i][j] = sp.minus(h[6 + i][j], sp.total(onto[j][i]))
             h[6 + i][3 + j] = sp.minus(h[6 + i][3 + j], sp.total(twisted[i]))
     for i in range(3):
-        row = _on_base(c.arm, (onto[0][i], onto[1][i], onto[2][i]))
+        row = sp.wrench(c.arm, [column[i] for column in onto])
         for j in range(i + 1):
             h[6 + i][6 + j] = sp.plus(h[6 + i][6 + j], sp.total(row[j]))
 

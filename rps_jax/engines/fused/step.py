@@ -83,8 +83,8 @@ def to_mujoco(body: Body, state: State, twist: Vec) -> Motion:
     v = sp.sub(state.v, sp.to_world(m, sp.cross(spin, com)))
     p = sp.sub(state.p, sp.to_world(m, com))
     if state.driven is None:
-        turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-        base = *sp.turned(turn, twist), twist[2]
+        turn = sp.turn(state.base[2])
+        base = sp.turned(turn, twist)
         last, integral = tuple(jnp.zeros_like(x) for x in state.base), None
     else:
         base, last, integral = state.driven
@@ -112,7 +112,7 @@ def step(
     m, dt, driven = sp.matrix(state.q), physics.timestep, state.driven
     contacts = [on_ground(body, state, m, physics), on_base(body, state, m, twist, physics)]
     contacts += [on_wall(body, state, m, wall, physics) for wall in body.walls or ()]
-    turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    turn = sp.turn(state.base[2])
     base = Base()
     if robot is not None and driven is not None:
         force, integral = push(robot, driven.integral, twist, driven.v, turn, dt)
@@ -128,8 +128,7 @@ def step(
         driven = driven._replace(v=sp.add(driven.v, sp.scale(dt, b[0])), a=b[0])
     wrench_sum = state.wrench_sum
     if wrench_sum is not None:
-        offset = (state.p[0] - state.base[0], state.p[1] - state.base[1])
-        arm = (contacts[1].r[0] + offset[0], contacts[1].r[1] + offset[1])
+        arm = sp.add(contacts[1].r[:2], sp.sub(state.p[:2], state.base[:2]))
         wrench_sum = sp.add(wrench_sum, wrench_on_base(contacts[1], arm, x, turn, physics))
     v = sp.add(state.v, sp.scale(dt, a))
     w = sp.add(state.w, sp.scale(dt, sp.to_body(m, alpha)))
@@ -139,18 +138,9 @@ def step(
     sinc = 0.5 * (1 - half * half / 6)
     q = sp.times(state.q, (1 - half * half / 2 + half**4 / 24, *sp.scale(sinc, angle)))
     length = jax.lax.rsqrt(sp.dot(q, q))
-    if driven is None:
-        c, s = turn
-        base = (
-            state.base[0] + dt * (c * twist[0] - s * twist[1]),
-            state.base[1] + dt * (s * twist[0] + c * twist[1]),
-            state.base[2] + dt * twist[2],
-        )
-    else:
-        base = sp.add(state.base, sp.scale(dt, driven.v))
-    p = sp.add(state.p, sp.scale(dt, v))
-    q = tuple(x * length for x in q)
-    return State(base, p, q, v, w, a, alpha, driven, wrench_sum)  # type: ignore[arg-type]
+    velocity = sp.turned(turn, twist) if driven is None else driven.v
+    base, p = sp.add(state.base, sp.scale(dt, velocity)), sp.add(state.p, sp.scale(dt, v))
+    return State(base, p, sp.scale(length, q), v, w, a, alpha, driven, wrench_sum)
 
 
 class FusedStage(NamedTuple):

@@ -292,7 +292,7 @@ class Corridor(Path):
     def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
         """Raise InputError for a corridor narrower than base or objects, or a wall at the base."""
         super().check_room(shell, object_width)
-        narrowest = self.width.low * (self.door_width.low if self.doors else 1)
+        narrowest = 2 * self.free_room
         for name, size in (("base", 2 * float(shell.half[1])), ("widest object", object_width())):
             if narrowest <= size:
                 rule = f"the {name} is {size:.2f} m wide, and the narrowest place must be wider"

@@ -80,7 +80,9 @@ class PoseCourse(NamedTuple):
         face, way, first = progress.face, progress.way, progress.first
         heading, is_round = self.heading, footprint.vertices.shape[0] < 3
         if is_round:
-            way = _extended(way, middle)
+            way = jnp.where(jnp.isfinite(way), way, middle)
+            far = planar.norm(middle - way[0]) > _SPACING
+            way = jnp.where(far, jnp.concatenate([middle[None], way[:2]]), way)
             direction = planar.direction(middle - way[2])
         else:
             contact = planar.rotate(-yaw, positions.p_world_contact - middle)
@@ -117,13 +119,6 @@ class PoseCourse(NamedTuple):
         tip = np.asarray(self.p_world_goal, float)
         tail = tip - _ARROW * solid.unit(np.asarray(self.heading, float))
         return {"goal": np.stack([tail, tip], axis=-2)}
-
-
-def _extended(way: Float[Array, "3 2"], middle: Float[Array, "2"]) -> Float[Array, "3 2"]:
-    """Return the stored positions of a way that has come to `middle` [m]."""
-    way = jnp.where(jnp.isfinite(way), way, middle)
-    far = planar.norm(middle - way[0]) > _SPACING
-    return jnp.where(far, jnp.concatenate([middle[None], way[:2]]), way)
 
 
 def _pushed_face(
