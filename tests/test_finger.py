@@ -109,6 +109,14 @@ def test_outlines_without_sense_are_refused():
     assert_allclose(finger.check_outline(SQUARE[::-1]), SQUARE[::-1][::-1])
 
 
+@pytest.fixture(autouse=True, scope="module")
+def small_batches():
+    """Pad pushes to batches of 16, half of the package's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(objects, "_SMALL_BATCH", 16)
+        yield
+
+
 TRUTH = {"log_friction": np.log(0.2), "ring": 0.8, "camera_x": 8e-4, "marker_yaw": 0.02}
 
 
