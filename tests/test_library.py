@@ -69,7 +69,7 @@ TUNED = {"objects": ("random_cylinder",), "tuned": ("K_h", "K_v"), "worlds": 2, 
 STORED = {  # from the run folder of a sweep and a new folder, the answer of a call
     "sweep": lambda run, out: rps_jax.sweep("rps", DRUMS, worlds=8, out=out, **SHARED),
     "score": lambda run, out: rps_jax.score("nps", domain=DRUMS, worlds=4, out=out, **SHARED),
-    "regress": lambda run, out: rps_jax.regress({"mine": "rps"}, worlds=3, out=out, **SHARED),
+    "regress": lambda run, out: rps_jax.regress({"mine": "rps"}, worlds=1, out=out, **SHARED),
     "push": lambda run, out: rps_jax.push("cylinder", target=(1.0, 0.5), out=out, **FAST).data,
     "replay": lambda run, out: rps_jax.replay(run, 2, out=out).data,
     "gallery": lambda run, out: rps_jax.gallery(run, out=out),
