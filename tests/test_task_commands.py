@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from helpers import ROOT, refusal, refusing, rps, setting_of
+from helpers import ROOT, refusal, refusing, row, rps, setting_of
 from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
@@ -291,7 +291,7 @@ def test_an_environment_ends_at_a_wall_and_counts_the_way_along_the_path():
 
 def test_the_curriculum_leaves_paths_alone():
     worlds = rps_jax.draw_worlds(DRUMS, task=TASK, setting=SETTING).worlds
-    world = jax.tree.map(lambda x: x[0], worlds)
+    world = row(worlds, 0)
     assert ease(world, jnp.asarray(0.1)) is world
     eased = ease(world._replace(task=Nothing()), jnp.asarray(0.0)).p_world_target
     assert np.hypot(*eased) == pytest.approx(0.8)
