@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
-from rps_jax.geometry import planar, polyline
+from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Entries, Float, Pytree
 from rps_jax.geometry.friction import friction_of_pads, solved
 from rps_jax.geometry.vectors import Vec, trace_one_world
@@ -90,8 +90,7 @@ def uniform_pads(outline: np.ndarray, count: int = _NODES) -> np.ndarray:
     width = (high - low) / cells
     at = [low[k] + width[k] / fine * (np.arange(cells[k] * fine) + 0.5) for k in (0, 1)]
     points = np.stack(np.meshgrid(*at, indexing="ij"), axis=-1)
-    edges = outline @ (1, 1j), np.roll(outline, -1, axis=0) @ (1, 1j)
-    inside = polyline.is_inside(points.reshape(-1, 1, 2) @ (1, 1j), *edges)
+    inside = distances(outline, points.reshape(-1, 2)) < 0
     weight = inside.reshape(cells[0], fine, cells[1], fine)
     at_cell = points.reshape(cells[0], fine, cells[1], fine, 2)
     load = weight.sum(axis=(1, 3)).astype(float)
@@ -134,6 +133,12 @@ def _push(slider: Slider, path: Array, pose: Array, steps: int) -> Pushed:
     (last, _), (poses, gaps) = jax.lax.scan(step, first, tip)
     gap = gap_of(slider, last, tips[-1])[0]
     return Pushed(jnp.concatenate([poses, last[None]]), jnp.append(gaps, gap))
+
+
+def distances(outline: ArrayLike, points: ArrayLike) -> np.ndarray:
+    """Return signed distances (P,) [m] of points (P, 2) from a polygon, negative inside."""
+    corners = jnp.asarray(outline)
+    return np.asarray(jax.vmap(lambda point: _nearest(corners, point)[0])(jnp.asarray(points)))
 
 
 def _nearest(outline: Array, point: Array) -> tuple[Array, Array]:
