@@ -49,7 +49,6 @@ def replayed(run, law):
 
 CASES = {
     "a law in C, in hostile worlds": ("rps_plus", "hostile,objects=random_prism"),
-    "a robot with limits in a corridor": ("nps", "real,objects=random_box", "corridor"),
     "a law that XLA compiles, along a path": (
         "learned",
         "wide,objects=random_cylinder",
@@ -57,7 +56,11 @@ CASES = {
         "fused",
         1.0,
     ),
-    "a law that senses force": ("force_push", "wide,objects=random_cylinder"),
+    "a law that senses force, on a robot with limits in a corridor": (
+        "force_push_published",
+        "real,objects=random_cylinder",
+        "corridor,width=2:2.2,length=8:10",
+    ),
     "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
 }
 HALL = {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]], "start": [1.5, 3, 0], "goal": [7, 3]}
@@ -67,6 +70,8 @@ TASKS = {
 }  # with places for the widest object
 SLOW_CASES = {
     "MJX": ("rps", "wide,objects=random_box", "reach", "mjx", 1.0),
+    "a robot with limits in a corridor": ("nps", "real,objects=random_box", "corridor"),
+    "a law of touch": ("force_push", "wide,objects=random_cylinder"),
     "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),
     **{
         f"{law}, {domain}, {task}": (law, domain, TASKS.get(task, task))
