@@ -100,7 +100,7 @@ def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys):
     drums = "--domain wide,objects=random_cylinder"
     options = f"{drums} --laws rps_plus --engine quasistatic --horizon 3 --slots {SLOTS}"
     run, path, out = tmp_path / "sweep", tmp_path / "world.mcap", tmp_path / "shadow"
-    assert rps(f"sweep --worlds 2 {options} --out", run) == 0
+    assert rps(f"sweep --worlds {SLOTS} {options} --out", run) == 0
     assert rps(f"replay {run} 1 --bag {path} --no-video --out", tmp_path / "replay") == 0
     mine = tmp_path / "mine.json"
     mine.write_text(json.dumps({"d_near": 0.3}))

@@ -181,12 +181,10 @@ def test_a_run_of_an_earlier_version_goes_on(tmp_path):
 
 def test_other_questions_take_a_task():
     brief = replace(SETTING, rules=Rules(horizon=2.0))
-    options = {"task": TASK, "setting": brief}
-    trees = rps_jax.ladder(
-        "rps", (DRUMS, "wide,objects=random_cylinder,mass=3"), worlds=2, **options
-    )
+    options = {"task": TASK, "setting": brief, "worlds": 12, "slots": 12}  # as of `run`
+    trees = rps_jax.ladder("rps", (DRUMS, "wide,objects=random_cylinder,mass=3"), **options)
     assert all("wall_touch" in trees[name] for name in trees)
-    assert rps_jax.evaluate("rps", DRUMS, worlds=2, **options).progress.sizes["world"] == 2
+    assert rps_jax.evaluate("rps", DRUMS, **options).progress.sizes["world"] == 12
     assert Sensitivity("rps", DRUMS, worlds=400, task=TASK).factors.count("path") == 1
     tuned = {"tuned": ("K_h",), "objects": ("random_cylinder",), "domain": DRUMS, "task": TASK}
     assert all(d.task.kind == "corridor" for d in TuneES("rps", **tuned).domains)
