@@ -243,7 +243,7 @@ def test_candidates_have_equal_worlds_in_any_batch():
     assert_array_equal(second.score[0], second.score[1])
     assert (first.score[1] != first.score[0]).any()
     (alone,), _ = room.score_candidates(
-        [Candidates(paper(3), domains, 3, np.arange(1, 2))], BRIEF, Objective(), slots=8
+        [Candidates(paper(8), domains, 3, np.arange(1, 2))], BRIEF, Objective(), slots=8
     )
     assert_allclose(alone.score[0], second.score[0, [1, 4]], rtol=1e-4)
 

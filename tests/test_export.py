@@ -65,7 +65,10 @@ def compiled(compiler, source, *options):
 # --- C -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [name for name in LAWS if name not in ("nps", "learned")])
+# The steps of rps and nps are in rps_plus, and `learned` differs from learned_small in numbers.
+@pytest.mark.parametrize(
+    "name", [slow(x) if x in ("rps", "nps", "pursuit", "learned") else x for x in LAWS]
+)
 def test_a_law_in_c_agrees_with_jax(name, tmp_path):
     result = agreement(name, "double", 10_000, tmp_path)
     assert (result.inputs, result.unexplained) == (10_000, 0)
