@@ -173,7 +173,7 @@ def test_every_example_of_the_package_is_run():
 
 # Questions whose small runs take longest; other tests run them, too.
 LONG = {"hardware", "learn", "ladder", "regress", "ceiling", "score", "attack", "replay"}
-LONG |= {"value_and_grad", "gallery", "fit", "paper", "tune_grad", "fit_object"}
+LONG |= {"value_and_grad", "rollout", "gallery", "fit", "paper", "tune_grad", "fit_object"}
 
 
 def mark_long(name):
