@@ -340,13 +340,7 @@ def docstrings() -> list[str]:
 
 
 def row(tree: Any, i: Any) -> Any:
-    """Return a row or a slice of rows of every leaf; one program computes rows of JAX."""
-    is_of_jax = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(tree))
-    return (_row if is_of_jax and isinstance(i, int) else _row.__wrapped__)(tree, i)
-
-
-@jax.jit
-def _row(tree: Any, i: Any) -> Any:
+    """Return a row or a slice of rows of every leaf."""
     return jax.tree.map(lambda leaf: leaf[i], tree)
 
 

@@ -70,8 +70,6 @@ TASKS = {
 }  # with places for the widest object
 SLOW_CASES = {
     "MJX": ("rps", "wide,objects=random_box", "reach", "mjx", 1.0),
-    "a robot with limits in a corridor": ("nps", "real,objects=random_box", "corridor"),
-    "a law of touch": ("force_push", "wide,objects=random_cylinder"),
     "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),
     **{
         f"{law}, {domain}, {task}": (law, domain, TASKS.get(task, task))
