@@ -111,27 +111,24 @@ def test_outlines_without_sense_are_refused():
     assert_allclose(finger.check_outline(SQUARE[::-1]), SQUARE[::-1][::-1])
 
 
-@pytest.fixture(autouse=True, scope="module")
-def small_batches():
-    """Pad pushes to batches of 16, half of the package's."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(objects, "_SMALL_BATCH", 16)
-        yield
-
-
 TRUTH = {"log_friction": np.log(0.2), "ring": 0.8, "camera_x": 8e-4, "marker_yaw": 0.02}
 
 
 @pytest.fixture(scope="module")
 def measured():
-    """Noisy pushes of a known object, whose camera and markers are misplaced."""
+    """Noisy pushes of a known object, whose camera and markers are misplaced.
+
+    One program, of 16 pushes, simulates all batches.
+    """
     path, pose = random_pushes(SQUARE, 40, seed=5)
-    x = jnp.asarray([TRUTH.get(name, 0.0) for name in objects.PRIOR])
-    inputs = [jnp.asarray(y) for y in (path, pose, pose)]
+    x = np.array([TRUTH.get(name, 0.0) for name in objects.PRIOR])
     fixed = objects._fixed(SQUARE, finger.uniform_pads(SQUARE), RADIUS)
-    end = np.asarray(objects._simulate(x, fixed, *inputs)[0], float)
-    end = end + np.random.default_rng(0).normal(size=end.shape) * [2e-4, 2e-4, 2e-3]
-    return Pushes(path, pose, end)
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("_SMALL_BATCH", "_BATCH"):
+            patch.setattr(objects, name, 16)
+        end = objects._batched(objects._simulate, x, fixed, Pushes(path, pose, pose))[0]
+        noise = np.random.default_rng(0).normal(size=end.shape) * [2e-4, 2e-4, 2e-3]
+        yield Pushes(path, pose, end + noise)
 
 
 def test_a_fit_finds_the_object_and_predicts_other_pushes(measured):
