@@ -42,7 +42,7 @@ def recorded(tmp_path_factory):
     return path, trace
 
 
-LAWS = ("rps_plus", "learned", "aps", "force_push_published")
+LAWS = ("rps_plus", "learned_small", "aps", "force_push_published")
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -53,7 +53,8 @@ def test_a_law_reproduces_every_twist_from_the_bag_of_a_simulation(law, tmp_path
         push("box", target=(1.5, 0.2), law=law, bag=path, setting=FUSED)
         assert np.abs(bag.read(path)["f_robot"]).max() > 1
     elif law != "rps_plus":
-        push("cylinder", target=(-1.0, 0.5), law=law, bag=path, setting=BRIEF)
+        pushed = "box" if law == "learned_small" else "cylinder"
+        push(pushed, target=(-1.0, 0.5), law=law, bag=path, setting=BRIEF)
     results = shadow(path, law)
     assert results.sizes == {"source": 2, "time": 501 if law == "force_push_published" else 301}
     for name in TWIST:
@@ -100,7 +101,7 @@ def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys):
     drums = "--domain wide,objects=random_cylinder"
     options = f"{drums} --laws rps_plus --engine quasistatic --horizon 3 --slots {SLOTS}"
     run, path, out = tmp_path / "sweep", tmp_path / "world.mcap", tmp_path / "shadow"
-    assert rps(f"sweep --worlds 2 {options} --out", run) == 0
+    assert rps(f"sweep --worlds {SLOTS} {options} --out", run) == 0
     assert rps(f"replay {run} 1 --bag {path} --no-video --out", tmp_path / "replay") == 0
     mine = tmp_path / "mine.json"
     mine.write_text(json.dumps({"d_near": 0.3}))

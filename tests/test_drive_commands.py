@@ -124,13 +124,13 @@ def test_the_ceiling_plans_without_a_sideways_velocity(drive):
 def test_a_law_is_learned_with_actions_of_two_numbers(tmp_path):
     small = {"network": "mlp", "width": 4, "num_envs": 4, "num_steps": 2, "num_minibatches": 1}
     small |= {"drawn": 4, "validation": 2, "minutes": 0, "updates": 1}
-    robot, fast = ROBOTS["differential"], Setting("quasistatic")
+    robot, fast = ROBOTS["differential"], Setting("fused", rules=Rules(horizon=3.0))
     curve = rps_jax.learn(DRUMS, **small, robot=robot, setting=fast, out=tmp_path)
     assert curve.spread.notnull().all()
     law = str(tmp_path / "policy.npz")
     assert registry.law_of(registry.resolve_law(law)[1]).drives == ("omni", "differential", "car")
     options = {"robot": robot, "skin": "capacitive", "target": (1.0, 1.0)}
-    trace = rps_jax.push(law=law, **options, setting=BRIEF)
+    trace = rps_jax.push(law=law, **options, setting=fast)
     assert not trace.data.v_y.any()
     assert trace.data.omega.any()
     again = {**small, "updates": 2, "setting": fast, "out": tmp_path / "again"}

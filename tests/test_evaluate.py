@@ -89,7 +89,7 @@ def test_no_command_meets_the_worlds_of_a_tuner(monkeypatch):
     commands = {name: question_type(name) for name in known()}
     seeded = {k for k, kind in commands.items() if "setting" in {f.name for f in fields(kind)}}
     tuned, validated, rest = set(), set(), set()
-    for seed in (0, 1, 2**32 - 1):
+    for seed in (0, 2**32 - 1):
         setting = Setting(seed=seed)
         for name in TUNERS:
             tune, validate = tuner_keys(commands[name](setting=setting))
@@ -135,10 +135,10 @@ def test_a_split_of_a_setting_is_that_of_its_worlds_and_of_its_record():
 
 def test_results_are_labelled_as_those_of_a_sweep():
     both = replace(CYLINDERS, objects=("random_cylinder", "cylinder"))
-    results = evaluate(paper(2), both, 3, split="test", **seeded(4))
-    assert dict(results.sizes) == {"candidate": 2, "world": 3, "pose": 3}
-    assert results.object.values.tolist() == ["random_cylinder", "cylinder", "random_cylinder"]
-    for index in range(3):
+    results = evaluate(paper(2), both, 4, split="test", **seeded(4))
+    assert dict(results.sizes) == {"candidate": 2, "world": 4, "pose": 3}
+    assert results.object.values.tolist() == 2 * ["random_cylinder", "cylinder"]
+    for index in range(4):
         drawn = draws.table(draws.draw(both, seed_of(4, "test"), [index]))
         for name, ((value,), unit) in drawn.items():
             assert results[name].values[index] == value
@@ -243,7 +243,7 @@ def test_candidates_have_equal_worlds_in_any_batch():
     assert_array_equal(second.score[0], second.score[1])
     assert (first.score[1] != first.score[0]).any()
     (alone,), _ = room.score_candidates(
-        [Candidates(paper(3), domains, 3, np.arange(1, 2))], BRIEF, Objective(), slots=8
+        [Candidates(paper(8), domains, 3, np.arange(1, 2))], BRIEF, Objective(), slots=8
     )
     assert_allclose(alone.score[0], second.score[0, [1, 4]], rtol=1e-4)
 

@@ -125,8 +125,6 @@ SHELL = [
     ("rps --help >&-", 0, ""),
     ("rps --help | head -1 >&2", 0, "usage"),
     ("rps psh >&- 2>&-", 2, ""),
-    ("rps psh 2>/dev/full", 2, ""),
-    ("rps psh 2>&1 | true", 2, ""),
     # Variables.
     ("MUJOCO_GL=vulkan push", 2, "MUJOCO_GL = vulkan is not allowed .* set it to egl"),
     ("JAX_ENABLE_X64=maybe push", 2, "jax cannot be imported .*JAX_ENABLE_X64.*: correct or"),
@@ -139,6 +137,8 @@ SHELL = [
     ),
 ]
 MORE = [
+    ("rps psh 2>/dev/full", 2, ""),
+    ("rps psh 2>&1 | true", 2, ""),
     ("MUJOCO_GL=vulkan rps doctor >&2", 0, "FAILS: MUJOCO_GL = vulkan is not allowed"),
     ("rps sweep --help | head -1 >&2", 0, "usage"),
     ("rps doctor >&-", 0, ""),

@@ -56,7 +56,9 @@ def test_a_push_through_the_centre_does_not_turn():
 def test_the_finger_stays_on_outlines_of_any_shape():
     for outline in (SQUARE, STAR, WEDGE):
         path, pose = random_pushes(outline, 64)
-        pushed = finger.push(slider_of(outline), jnp.asarray(path), jnp.asarray(pose))
+        corners, pads, _ = objects._fixed(outline, finger.uniform_pads(outline), RADIUS)
+        slider = slider_of(corners, pads=pads)  # all of one shape
+        pushed = finger.push(slider, jnp.asarray(path), jnp.asarray(pose))
         gap = np.asarray(pushed.gap)
         assert np.isfinite(pushed.pose).all()
         assert gap.min() > -4e-4
@@ -114,14 +116,19 @@ TRUTH = {"log_friction": np.log(0.2), "ring": 0.8, "camera_x": 8e-4, "marker_yaw
 
 @pytest.fixture(scope="module")
 def measured():
-    """Noisy pushes of a known object, whose camera and markers are misplaced."""
+    """Noisy pushes of a known object, whose camera and markers are misplaced.
+
+    One program, of 16 pushes, simulates all batches.
+    """
     path, pose = random_pushes(SQUARE, 40, seed=5)
-    x = jnp.asarray([TRUTH.get(name, 0.0) for name in objects.PRIOR])
-    inputs = [jnp.asarray(y) for y in (path, pose, pose)]
+    x = np.array([TRUTH.get(name, 0.0) for name in objects.PRIOR])
     fixed = objects._fixed(SQUARE, finger.uniform_pads(SQUARE), RADIUS)
-    end = np.asarray(objects._simulate(x, fixed, *inputs)[0], float)
-    end = end + np.random.default_rng(0).normal(size=end.shape) * [2e-4, 2e-4, 2e-3]
-    return Pushes(path, pose, end)
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("_SMALL_BATCH", "_BATCH"):
+            patch.setattr(objects, name, 16)
+        end = objects._batched(objects._simulate, x, fixed, Pushes(path, pose, pose))[0]
+        noise = np.random.default_rng(0).normal(size=end.shape) * [2e-4, 2e-4, 2e-3]
+        yield Pushes(path, pose, end + noise)
 
 
 def test_a_fit_finds_the_object_and_predicts_other_pushes(measured):

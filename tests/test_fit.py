@@ -264,7 +264,7 @@ def test_a_posterior_is_as_wide_as_the_noise_and_else_the_prior(toy):
 
 def test_four_observations_halve_the_width(toy):
     single, fourfold = (
-        posterior.sample(toy, np.full((n, 1), 0.5), 4000)[:, 0].std() for n in (1, 4)
+        posterior.sample(toy, np.full((n, 1), 0.5), 2000)[:, 0].std() for n in (1, 4)
     )
     assert fourfold / single == pytest.approx(0.5, abs=0.24)
 

@@ -202,7 +202,7 @@ def test_a_study_is_labelled_and_cached(tmp_path, monkeypatch):
     kinds = {name: replace(grounds.GROUNDS[name], speeds=(0.2,)) for name in ("fast", "standard")}
     monkeypatch.setattr(grounds, "GROUNDS", kinds)
     monkeypatch.setattr(grounds, "HEIGHTS", (0.06, 0.34))
-    options = {"objects": ("box",), "offsets": (0.05, 0.12), "steps": 50}
+    options = {"objects": ("box",), "offsets": (0.05, 0.12), "steps": 20}
     progress = []
     results = grounds.run(tuple(kinds), Run(tmp_path, progress.append), **options)
     sizes = {"ground": 2, "object": 1, "offset": 2, "speed": 1, "at_height": 2}

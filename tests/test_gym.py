@@ -17,6 +17,7 @@ from helpers import (
     row,
     same,
     setting_of,
+    slow,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -304,7 +305,7 @@ def test_checks_that_a_user_asks_of_jax_do_not_stop_it(vector, option, value):
     assert np.isfinite(scores).all()
 
 
-@pytest.mark.parametrize("kind", [gymnasium.make, gymnasium.make_vec])
+@pytest.mark.parametrize("kind", [gymnasium.make, slow(gymnasium.make_vec)])
 def test_a_film_is_recorded(kind, tmp_path):
     pytest.importorskip("moviepy")
     wrappers = gymnasium.wrappers if kind is gymnasium.make else gymnasium.wrappers.vector

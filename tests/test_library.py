@@ -15,6 +15,7 @@ from helpers import (
     output_of,
     rps,
     setting_of,
+    slow,
 )
 from numpy.testing import assert_array_equal
 
@@ -60,16 +61,16 @@ def test_a_sweep_in_memory_is_the_same_as_one_in_a_folder(engine, tmp_path):
 def run(tmp_path_factory):
     """The folder of a sweep, and its results."""
     folder = tmp_path_factory.mktemp("sweep")
-    return folder, rps_jax.sweep(LAWS, DRUMS, worlds=4, out=folder, **BRIEF)
+    return folder, rps_jax.sweep(LAWS, DRUMS, worlds=SLOTS, out=folder, **BRIEF)
 
 
 FAST = {"setting": rps_jax.Setting("quasistatic", rules=RULES)}
-SHARED = FAST | {"slots": SLOTS}  # with one program for all
-TUNED = {"objects": ("random_cylinder",), "tuned": ("K_h", "K_v"), "worlds": 2, "validation": 4}
+SHARED = FAST | {"slots": SLOTS}  # with one program for all, of which no slot is empty
+TUNED = {"objects": ("random_cylinder",), "tuned": ("K_h", "K_v"), "worlds": 2, "validation": SLOTS}
 STORED = {  # from the run folder of a sweep and a new folder, the answer of a call
     "sweep": lambda run, out: rps_jax.sweep("rps", DRUMS, worlds=8, out=out, **SHARED),
-    "score": lambda run, out: rps_jax.score("nps", domain=DRUMS, worlds=4, out=out, **SHARED),
-    "regress": lambda run, out: rps_jax.regress({"mine": "rps"}, worlds=3, out=out, **SHARED),
+    "score": lambda run, out: rps_jax.score("nps", domain=DRUMS, worlds=8, out=out, **SHARED),
+    "regress": lambda run, out: rps_jax.regress({"mine": "rps"}, worlds=1, out=out, **SHARED),
     "push": lambda run, out: rps_jax.push("cylinder", target=(1.0, 0.5), out=out, **FAST).data,
     "replay": lambda run, out: rps_jax.replay(run, 2, out=out).data,
     "gallery": lambda run, out: rps_jax.gallery(run, out=out),
@@ -83,7 +84,7 @@ STORED = {  # from the run folder of a sweep and a new folder, the answer of a c
 DOMAIN_TEXTS = {"push": None, "regress": "wide", "tune_es": "wide"}  # the rest: `DRUMS`
 
 
-@pytest.mark.parametrize("name", STORED)
+@pytest.mark.parametrize("name", [slow(x) if x in ("score", "gallery") else x for x in STORED])
 def test_stored_results_are_those_of_the_call_and_of_xarray(name, run, tmp_path):
     answer, path = STORED[name](run[0], tmp_path / "run"), tmp_path / "run" / "results.nc"
     assert {"command", "version", "seed", "engine"} <= answer.attrs.keys()
@@ -102,7 +103,7 @@ def test_stored_results_are_those_of_the_call_and_of_xarray(name, run, tmp_path)
 
 def test_candidates_are_labelled_by_their_parameters():
     laws = ["rps,K_h=0.3", "rps,K_h=0.6"]
-    results = rps_jax.evaluate(laws, DRUMS, 2, split="validate", **SHARED)
+    results = rps_jax.evaluate(laws, DRUMS, 4, split="validate", **SHARED)
     assert results.K_h.dims == ("candidate",)
     assert results.K_h.values.tolist() == [0.3, 0.6]
     assert results.swap_dims(candidate="K_h").score.sel(K_h=0.6).dims == ("world",)
@@ -172,7 +173,7 @@ def test_every_example_of_the_package_is_run():
 
 # Questions whose small runs take longest; other tests run them, too.
 LONG = {"hardware", "learn", "ladder", "regress", "ceiling", "score", "attack", "replay"}
-LONG |= {"value_and_grad", "gallery", "fit", "paper", "tune_grad", "fit_object"}
+LONG |= {"value_and_grad", "rollout", "gallery", "fit", "paper", "tune_grad", "fit_object"}
 
 
 def mark_long(name):

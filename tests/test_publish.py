@@ -27,7 +27,7 @@ from sweeps.random_worlds import million
 from sweeps.speed import study as speed
 
 SWEEPS = ROOT / "sweeps"
-PUSH = "rps sweep --domain wide,objects=random_cylinder --worlds 3 --engine quasistatic --horizon 1"
+PUSH = "rps sweep --domain wide,objects=random_cylinder --worlds 8 --engine quasistatic --horizon 1"
 
 
 @pytest.mark.parametrize("path", study.published(), ids=lambda path: path.stem)
@@ -76,7 +76,7 @@ def test_failed_recipes_are_named_and_the_others_are_run(recipe_folder, capsys):
     )
     assert [column["name"] for column in first["columns"]] == ["", "law", "all"]
     assert first["rows"][0][:2] == ["drums", "rps"]
-    assert second["rows"] == [["3"]]
+    assert second["rows"] == [["8"]]
     assert first["command"] == second["command"] == [f"{PUSH} --laws rps"]
     assert first["device"] == "a core"
     assert first["probes"] == {}

@@ -394,7 +394,8 @@ def test_a_law_refuses_invalid_parameters_and_restores_valid_ones(name):
     assert type(restored) is type(params)
 
 
-ELSEWHERE = {"pose", "path_pose", "rps_plus", "unicycle"}  # whose successes other tests assert
+# Laws whose successes other tests assert, and variants of other laws here.
+ELSEWHERE = {"pose", "path_pose", "rps_plus", "unicycle", "path_pose_drive", "learned"}
 
 
 @pytest.mark.parametrize(

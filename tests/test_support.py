@@ -4,10 +4,11 @@ import re
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import refusing, slow
+from helpers import diagonal, jitted, refusing, slow
 from numpy.testing import assert_allclose, assert_array_equal
 from staging import FINE, simulate, step_in_c
 
@@ -78,15 +79,18 @@ def force(at, share, radius, twist):
     return np.stack([*f[:2].sum(axis=2), moment], axis=1)
 
 
+@jitted
 def twists_under(at, share, radius, wrench, arm):
     """Return the twists (n, 3) of pads under wrenches, by the quasi-static engine's own cost."""
-    pads: Any = tuple(jnp.asarray(x)[:, None] for x in (*at.T, share, np.maximum(radius, 1e-4)))
-    v: Any = tuple(jnp.asarray(x) for x in (wrench / [1, 1, arm * arm]).T)
-    for i in range(80):
+    pads: Any = tuple(x[:, None] for x in (*at.T, share, jnp.maximum(radius, 1e-4)))
+
+    def refined(i: Any, v: Any) -> Any:
         g, h = friction_of_pads(pads, v, 1e-5)
         step = solved(tuple(a - b for a, b in zip(g, wrench.T, strict=True)), h)
-        v = tuple(a - (0.5 if i < 60 else 1.0) * b for a, b in zip(v, step, strict=True))
-    return np.stack(v, axis=1)
+        return tuple(a - jnp.where(i < 60, 0.5, 1.0) * b for a, b in zip(v, step, strict=True))
+
+    start = tuple((wrench / jnp.array([1, 1, arm * arm])).T)
+    return jnp.stack(jax.lax.fori_loop(0, 80, refined, start), axis=1)
 
 
 ERRORS = {  # largest and root mean square of the error of a twist, over its length
@@ -167,8 +171,10 @@ def integrals():
     return turns
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("engine", ["fused", "mujoco", "quasistatic", slow("mjx")])
+@pytest.mark.parametrize(
+    ("engine", "kind"),
+    [*diagonal(("fused", "mujoco", "quasistatic"), KINDS), *(slow("mjx", kind) for kind in KINDS)],
+)
 def test_a_box_turns_by_its_pressure_in_every_engine(engine, kind, integrals):
     """A smooth base turns it until it lies on the front; on corners it turns less."""
     turned = turn_in(engine, *inputs_of("box", kind))

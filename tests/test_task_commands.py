@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from helpers import ROOT, refusal, refusing, rps, setting_of
+from helpers import ROOT, refusal, refusing, row, rps, setting_of
 from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
@@ -181,12 +181,10 @@ def test_a_run_of_an_earlier_version_goes_on(tmp_path):
 
 def test_other_questions_take_a_task():
     brief = replace(SETTING, rules=Rules(horizon=2.0))
-    options = {"task": TASK, "setting": brief}
-    trees = rps_jax.ladder(
-        "rps", (DRUMS, "wide,objects=random_cylinder,mass=3"), worlds=2, **options
-    )
+    options = {"task": TASK, "setting": brief, "worlds": 12, "slots": 12}  # as of `run`
+    trees = rps_jax.ladder("rps", (DRUMS, "wide,objects=random_cylinder,mass=3"), **options)
     assert all("wall_touch" in trees[name] for name in trees)
-    assert rps_jax.evaluate("rps", DRUMS, worlds=2, **options).progress.sizes["world"] == 2
+    assert rps_jax.evaluate("rps", DRUMS, **options).progress.sizes["world"] == 12
     assert Sensitivity("rps", DRUMS, worlds=400, task=TASK).factors.count("path") == 1
     tuned = {"tuned": ("K_h",), "objects": ("random_cylinder",), "domain": DRUMS, "task": TASK}
     assert all(d.task.kind == "corridor" for d in TuneES("rps", **tuned).domains)
@@ -291,7 +289,7 @@ def test_an_environment_ends_at_a_wall_and_counts_the_way_along_the_path():
 
 def test_the_curriculum_leaves_paths_alone():
     worlds = rps_jax.draw_worlds(DRUMS, task=TASK, setting=SETTING).worlds
-    world = jax.tree.map(lambda x: x[0], worlds)
+    world = row(worlds, 0)
     assert ease(world, jnp.asarray(0.1)) is world
     eased = ease(world._replace(task=Nothing()), jnp.asarray(0.0)).p_world_target
     assert np.hypot(*eased) == pytest.approx(0.8)

@@ -45,20 +45,21 @@ def traced(monkeypatch):
     monkeypatch.setattr(native, "load", lambda name: True)
 
 
-QUICK = {("fused", "corridor"), *itertools.product(["quasistatic"], TASKS)}
+MODES = {"reverse": lambda f: jax.grad(jax.checkpoint(f)), "forward": jax.jacfwd}
+# In reverse mode JAX refuses loops of unknown length.
+QUICK = {("fused", "corridor", "forward"), *itertools.product(["quasistatic"], TASKS, ["reverse"])}
 
 
 @pytest.mark.usefixtures("traced")
 @pytest.mark.parametrize(
-    ("engine", "task"),
-    [pair if pair in QUICK else slow(*pair) for pair in itertools.product(SETTINGS, TASKS)],
+    ("engine", "task", "mode"),
+    [row if row in QUICK else slow(*row) for row in itertools.product(SETTINGS, TASKS, MODES)],
 )
-def test_rollouts_of_all_tasks_and_engines_have_all_transformations(engine, task):
-    """Trace them: JAX refuses loops of unknown length there."""
+def test_rollouts_of_all_tasks_and_engines_have_all_transformations(engine, task, mode):
+    """Trace them."""
     distance, worlds = final_distances(engine, task)
-    for transformed in (jax.grad(jax.checkpoint(distance)), jax.jacfwd(distance)):
-        shapes = jax.eval_shape(over_worlds(transformed), LAW, worlds)
-        assert {x.shape for x in jax.tree.leaves(shapes)} == {(2,)}
+    shapes = jax.eval_shape(over_worlds(MODES[mode](distance)), LAW, worlds)
+    assert {x.shape for x in jax.tree.leaves(shapes)} == {(2,)}
 
 
 @pytest.mark.usefixtures("traced")
