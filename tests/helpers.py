@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import itertools
 import re
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
@@ -112,6 +113,14 @@ def jitted(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 slow = partial(pytest.param, marks=pytest.mark.slow)  # values of a test that runs in .ci/slow
+
+
+def diagonal(*axes: Sequence[Any]) -> list[Any]:
+    """Return the product of axes as values of a test: a row for each value, the others slow."""
+    quick = [tuple(x[i % len(x)] for x in axes) for i in range(max(map(len, axes)))]
+    return [row if row in quick else slow(*row) for row in itertools.product(*axes)]
+
+
 SEEDS = strategies.integers(0, 2**32 - 1)
 
 
