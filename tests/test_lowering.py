@@ -173,10 +173,16 @@ def generated():
                 continue
             applied = functools.partial(function, **static)
             words = [str(getattr(value, "__name__", value)) for value in static.values()]
-            for kinds in itertools.product(DTYPES, repeat=count):
-                if not result_types(applied, kinds, SHAPES[0]) <= known:
+            of_vectors = {
+                kinds: result_types(applied, kinds, SHAPES[0])
+                for kinds in itertools.product(DTYPES, repeat=count)
+            }
+            only_scalars = not any(of_vectors.values())
+            for kinds, types in of_vectors.items():
+                if not (types or only_scalars) or not types <= known:
                     continue
-                shapes = [x for x in SHAPES[: 1 + count] if result_types(applied, kinds, x)]
+                rest = [x for x in SHAPES[1 : 1 + count] if result_types(applied, kinds, x)]
+                shapes = [*SHAPES[: bool(types)], *rest]
                 title = " ".join([f"lax.{name}", *words, "of", *kinds])
                 if shapes and title not in WITHOUT_REFERENCE:
                     case = functools.partial(apply_all, applied, kinds, shapes)
