@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import refusing, slow
+from helpers import jitted, refusing, slow
 from numpy.testing import assert_allclose
 from staging import Recording, drive, simulate
 
@@ -188,8 +188,9 @@ def test_a_trial_fails_where_an_object_is_pressed_into_a_wall(touch, depth, expe
     positions = Positions(
         at, at, zero > 0, jnp.zeros(3), footprint.rectangle(0.36, 0.29), at, zero, box
     )
-    progress, aim = course.step(course.start(), positions)
+    step = jitted(type(course).step)
+    progress, aim = step(course, course.start(), positions)
     assert progress.wall_touch == expected
     assert aim.failed == (expected != corridor.NOTHING)
     positions = positions._replace(base=jnp.array([0.0, 0.45, 0.0]))
-    assert course.step(course.start(), positions)[0].wall_touch == corridor.BASE
+    assert step(course, course.start(), positions)[0].wall_touch == corridor.BASE
