@@ -49,7 +49,6 @@ def replayed(run, law):
 
 CASES = {
     "a law in C, in hostile worlds": ("rps_plus", "hostile,objects=random_prism"),
-    "a robot with limits in a corridor": ("nps", "real,objects=random_box", "corridor"),
     "a law that XLA compiles, along a path": (
         "learned",
         "wide,objects=random_cylinder",
@@ -57,8 +56,11 @@ CASES = {
         "fused",
         1.0,
     ),
-    "a law that senses force": ("force_push", "wide,objects=random_cylinder"),
-    "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),
+    "a law that senses force, on a robot with limits in a corridor": (
+        "force_push_published",
+        "real,objects=random_cylinder",
+        "corridor,width=2:2.2,length=8:10",
+    ),
     "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
 }
 HALL = {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]], "start": [1.5, 3, 0], "goal": [7, 3]}
@@ -68,6 +70,7 @@ TASKS = {
 }  # with places for the widest object
 SLOW_CASES = {
     "MJX": ("rps", "wide,objects=random_box", "reach", "mjx", 1.0),
+    "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),
     **{
         f"{law}, {domain}, {task}": (law, domain, TASKS.get(task, task))
         for law in ("rps", "aps", "learned_small")
@@ -78,12 +81,8 @@ SLOW_CASES = {
 
 
 SLOW = [slow(x) for x in SLOW_CASES.values()]
-# Of each way to compile: C, a law of XLA in the loop of an engine in C, and XLA alone.
-COMPILED = (
-    "a law in C, in hostile worlds",
-    "a law that XLA compiles, along a path",
-    "a planar engine",
-)
+# Of each way to compile: C, and a law of XLA in the loop of an engine in C. Below: XLA alone.
+COMPILED = "a law in C, in hostile worlds", "a law that XLA compiles, along a path"
 FEW = [pytest.param(x, marks=[pytest.mark.parity] * (k in COMPILED)) for k, x in CASES.items()]
 
 
@@ -110,6 +109,12 @@ def test_the_bits_depend_on_the_stored_number_of_slots(run):
     plan = load_plan(folder)
     counts = {push.program_slots(folder, plan, "rps", i) for i in range(WORLDS)}
     assert counts == {2, SLOTS}  # there are 3 cylinders and 2 boxes
+
+
+@pytest.mark.parity
+def test_replays_in_a_planar_engine_have_the_bits_of_their_sweep(run):
+    folder, results = run
+    assert_equal_bits(replayed(folder, "rps"), results)
 
 
 def test_a_gallery_has_the_bits_of_its_sweep(run):
