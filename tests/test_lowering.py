@@ -173,16 +173,12 @@ def generated():
                 continue
             applied = functools.partial(function, **static)
             words = [str(getattr(value, "__name__", value)) for value in static.values()]
-            of_vectors = {
-                kinds: result_types(applied, kinds, SHAPES[0])
-                for kinds in itertools.product(DTYPES, repeat=count)
-            }
-            only_scalars = not any(of_vectors.values())
+            combinations = itertools.product(DTYPES, repeat=count)
+            of_vectors = {x: result_types(applied, x, SHAPES[0]) for x in combinations}
             for kinds, types in of_vectors.items():
-                if not (types or only_scalars) or not types <= known:
+                if not types <= known or (not types and any(of_vectors.values())):
                     continue
-                rest = [x for x in SHAPES[1 : 1 + count] if result_types(applied, kinds, x)]
-                shapes = [*SHAPES[: bool(types)], *rest]
+                shapes = [x for x in SHAPES[: 1 + count] if result_types(applied, kinds, x)]
                 title = " ".join([f"lax.{name}", *words, "of", *kinds])
                 if shapes and title not in WITHOUT_REFERENCE:
                     case = functools.partial(apply_all, applied, kinds, shapes)

@@ -397,12 +397,13 @@ def test_a_trial_ends_where_the_walls_are_not_known(registries):
     law = rps_jax.Law(lambda params: (), step)
     rps_jax.register_law("sideways", law, Sideways())
     far = [[[x, y + 5.5] for x, y in triangle] for triangle in rows[::2]]  # as many walls as before
-    cases = []
-    for polygons in (rows, rows[:20] + far):
-        task = {"polygons": polygons, "outline": outline, "start": [0, 0, 0], "goal": [8, 0]}
-        cases.append(Case("box", law="sideways", task=task, skin="ideal"))
+    task = {"outline": outline, "start": [0, 0, 0], "goal": [8, 0]}
+    cases = [
+        Case("box", law="sideways", task=task | {"polygons": polygons}, skin="ideal")
+        for polygons in (rows, rows[:20] + far)
+    ]
     outcome, _ = pushes.run(cases, setting_of(30.0))
-    parsed = room(polygons=rows, outline=outline, start=[0, 0, 0], goal=[8, 0])
+    parsed = room(**task, polygons=rows)
     y, further = outcome.base_pose[:, 1]
     reach = parsed._near[1]
     assert reach is not None
