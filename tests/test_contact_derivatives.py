@@ -99,7 +99,7 @@ def classes(fields, motion, twists, physics):
     return states
 
 
-@pytest.mark.parametrize("name", ["random_box", slow("random_cylinder")])
+@pytest.mark.parametrize("name", [slow("random_box"), "random_cylinder"])
 def test_a_step_has_the_derivative_of_its_difference(name, monkeypatch):
     """Vary 24 inputs and more at once, in 200 states of contact of each class."""
     monkeypatch.setattr(newton, "_TOLERANCE", 1e-13)
@@ -152,8 +152,8 @@ def products(a, b):
 @pytest.mark.parametrize(
     "domain",
     [
-        "real,objects=random_cylinder",
-        *(slow(x) for x in ("wide,objects=random_box", "real,objects=random_prism")),
+        "real,objects=random_prism",
+        *(slow(x) for x in ("wide,objects=random_box", "real,objects=random_cylinder")),
     ],
 )
 def test_derivatives_are_finite_and_both_modes_agree(domain):

@@ -261,14 +261,14 @@ def test_features_have_the_target_and_not_the_pose_of_the_object():
     world = jax.tree.map(jnp.asarray, soften_skins(rows(batch.worlds, 0)))
     params = RPSParams.paper()
     loop = control_loop(params, SETTING, smooth=True)
-    first, still = trial.start(world, params, loop.law), world
+    first = jax.jit(trial.start, static_argnums=2)(world, params, loop.law)
 
-    def change(world, qpos):
-        values = (
-            descent.features(x, params, first._replace(qpos=y), loop)
-            for x, y in ((world, qpos), (still, first.qpos))
-        )
-        return np.abs(np.subtract(*values)).max()
+    @jax.jit
+    def features(world, qpos):
+        return descent.features(world, params, first._replace(qpos=qpos), loop)
+
+    def change(*inputs):
+        return np.abs(np.subtract(features(*inputs), features(world, first.qpos))).max()
 
     assert change(world, first.qpos.at[3:5].add(0.1)) < 1e-6
     assert change(world._replace(p_world_target=world.p_world_target + 1.0), first.qpos) > 0.1

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ROOT, observation, refusals, refusing
+from helpers import ROOT, diagonal, observation, refusals, refusing
 
 from rps_jax import draw_worlds, engines, rollout
 from rps_jax.app.cli import flags, names
@@ -43,12 +43,7 @@ BASES = {
     "car": replace(CAR, lag=0.2),
     "car with traction": replace(CAR, traction=0.5),
 }
-_COMPILED = "differential with a limited force"  # the only base in mjx that no slow test has
-AXLES = [
-    pytest.param(name, engine, marks=[pytest.mark.slow] * (engine == "mjx" and name != _COMPILED))
-    for name in BASES
-    for engine in engines.names()
-]
+AXLES = diagonal([*BASES], engines.names()[::-1])  # a limited force is not for the planar engine
 
 
 class Weave(NamedTuple):

@@ -21,7 +21,6 @@ from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction
 
-pytestmark = pytest.mark.parity
 TWIST = (0.05, 0.01, 0.05)  # [m/s, m/s, rad/s]
 # Object, yaw [rad] and lateral offset [m]: flat on the face, corner first, the base's corner first.
 STARTS = (
@@ -53,6 +52,7 @@ def pushed(loaded, qpos, steps, physics=FINE):
     return *end, step_in_c(loaded.physics, qpos, TWIST, steps)
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 @pytest.mark.parametrize(("name", "yaw", "offset"), STARTS)
 def test_a_step_agrees_with_c_mujoco(name, yaw, offset, cone):
@@ -65,6 +65,7 @@ def test_a_step_agrees_with_c_mujoco(name, yaw, offset, cone):
     assert_allclose(velocity[3:], expected.qvel[3:], atol=slow)
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize(("name", "yaw", "offset"), [STARTS[1], STARTS[3], STARTS[4]])
 def test_a_push_of_three_seconds_agrees_with_c_mujoco(name, yaw, offset):
     """C MuJoCo drops one of two contacts of a tilted edge now and then, which rocks the object."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import ROOT, refusing, rps, setting_of
+from helpers import ROOT, refusing, rps, setting_of, slow
 from numpy.testing import assert_allclose
 
 from rps_jax import evaluate, push, sweep
@@ -66,7 +66,7 @@ def test_threads_read_the_file_of_a_law_once(tmp_path):
 # --- twists that are not finite ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "fused"])
+@pytest.mark.parametrize("engine", [slow("mujoco"), "fused"])
 def test_a_law_that_returns_nan_is_named_with_the_first_time(engine, tmp_path):
     """The law returns NaN in the fourth control step, as its state counts."""
     path = tmp_path / "mine.py"
@@ -121,7 +121,7 @@ def test_the_table_of_a_report_names_laws_that_returned_nan(kind):
 
 def test_a_push_says_that_the_law_returned_nan(tmp_path):
     path = write_law(tmp_path, "v_y = jnp.sqrt(-details.distance)")
-    trace = push("box", law=str(path), setting=setting_of(0.2))
+    trace = push("box", law=str(path), setting=BRIEF)
     assert trace.summary == "diverged at 0.00 s, since the law returned NaN"
 
 

@@ -173,8 +173,10 @@ def generated():
                 continue
             applied = functools.partial(function, **static)
             words = [str(getattr(value, "__name__", value)) for value in static.values()]
-            for kinds in itertools.product(DTYPES, repeat=count):
-                if not result_types(applied, kinds, SHAPES[0]) <= known:
+            combinations = itertools.product(DTYPES, repeat=count)
+            of_vectors = {x: result_types(applied, x, SHAPES[0]) for x in combinations}
+            for kinds, types in of_vectors.items():
+                if not types <= known or (not types and any(of_vectors.values())):
                     continue
                 shapes = [x for x in SHAPES[: 1 + count] if result_types(applied, kinds, x)]
                 title = " ".join([f"lax.{name}", *words, "of", *kinds])

@@ -82,14 +82,10 @@ def close(actual, desired, warm, rest):
         assert_allclose(a, b, rtol=1e-4, atol=rest)
 
 
-PAIRS = [
-    slow("box", "capacitive"),
-    ("cylinder", "ideal"),
-    ("prism", "capacitive"),
-]
-
-
-@pytest.mark.parametrize(("shape", "skin"), PAIRS)
+@pytest.mark.parametrize(
+    ("shape", "skin"),
+    [("cylinder", "ideal"), *(slow(x, "capacitive") for x in ("box", "prism"))],
+)
 def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
     stage, inputs, loop, pushing = build_push(shape, skin)
     computed = advanced(stage, inputs, pushing, loop, 1)

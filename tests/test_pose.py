@@ -189,10 +189,10 @@ def test_the_word_of_a_law_ends_a_trial(task, registries):
 
     law = Law(init, wait, is_done=lambda state: state[1])
     rps_jax.register_law("wait", law, WaitParams())
-    outcome = rps_jax.push(law="wait", task=task, setting=Setting("quasistatic")).outcome
-    assert float(outcome.time) == pytest.approx(1.02, abs=0.021)
-    assert not outcome.success
-    assert task == "reach" or outcome.task["declared"] == 1
+    outcome, _ = pushes.run([Case(law="wait", task=task)], Setting("quasistatic"))
+    assert float(outcome.time[0]) == pytest.approx(1.02, abs=0.021)
+    assert not outcome.success.any()
+    assert task == "reach" or outcome.task["declared"].all()
 
 
 CASES = {
@@ -230,12 +230,15 @@ def test_bad_goals_are_refused_in_one_sentence_before_anything_compiles(
 
 def ends_at(half, y, tilt=0.0, dead=(), gains=1.0):
     """Return the ends of a box (0.2, half) at y, in front of the paper's base."""
-    skin, x = CapacitiveSkin(), 0.363 + 0.2 * math.cos(tilt) + half * abs(math.sin(tilt))
+    return _ends_at(half, y, tilt, ~np.isin(np.arange(42), dead), gains * np.ones(42))
+
+
+@jitted
+def _ends_at(half, y, tilt, alive, gains):
+    skin, x = CapacitiveSkin(), 0.363 + 0.2 * jnp.cos(tilt) + half * abs(jnp.sin(tilt))
     box = fp.place(fp.rectangle(0.2, half), jnp.array([x, y]), tilt)
-    alive = ~np.isin(np.arange(42), dead)
     raw = skin._scan(skin.init(jax.random.PRNGKey(0)), box)[1]
-    signal = np.where(alive, gains * raw, 0.0)
-    return skins.ends_of(jnp.asarray(signal), jnp.asarray(alive), Shell(), skin.threshold)
+    return skins.ends_of(jnp.where(alive, gains * raw, 0.0), alive, Shell(), skin.threshold)
 
 
 def test_the_ends_of_a_flush_face_are_within_a_third_of_a_taxel():
@@ -455,11 +458,11 @@ def test_the_smooth_law_mixes_its_pushes_by_the_weight_of_the_contact():
     assert expected[0] > 0
     slide = expected[1] + expected[2] * (0.3625 + PoseParams().r)
     assert_allclose(slide, 0.2 * 0.01, rtol=0.2)
-    weigh = jax.jit(lambda w, K: last_twist(smooth, w, K, inputs[1]))
-    assert_allclose(weigh(jnp.asarray(1.0), 0.2), expected, atol=1e-7)
-    slopes = jax.jit(jax.jacfwd(lambda w, K: last_twist(smooth, w, K, inputs[1]), (0, 1)))
-    by_weight, by_gain = slopes(jnp.asarray(0.9), 0.2)
-    numeric = (weigh(jnp.asarray(0.91), 0.2) - weigh(jnp.asarray(0.89), 0.2)) / 0.02
+    twist = lambda w, K: [last_twist(smooth, w, K, inputs[1])] * 2  # noqa: E731
+    weigh = jitted(lambda w: jax.jacfwd(twist, (0, 1), has_aux=True)(w, 0.2))
+    assert_allclose(weigh(1.0)[1], expected, atol=1e-7)
+    (by_weight, by_gain), _ = weigh(0.9)
+    numeric = (weigh(0.91)[1] - weigh(0.89)[1]) / 0.02
     assert_allclose(by_weight, numeric, atol=2e-4)
     assert by_gain[1] > 1e-3
 
@@ -514,10 +517,8 @@ def test_tolerances_are_options_of_the_task():
 
 def test_the_law_asks_for_the_heading_where_the_goal_has_none():
     """Of a target without a heading it is the direction from the base's start."""
-    trace = rps_jax.push(
-        law="pose", target=(1.5, 0.0), task="reach", setting=Setting("quasistatic")
-    )
-    assert trace.outcome.success
+    outcome, _ = pushes.run([Case(law=FAST, target=(1.5, 0.0), task="reach")], Setting("fused"))
+    assert outcome.success.all()
     assert LAW.heading
 
 

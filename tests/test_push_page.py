@@ -32,7 +32,7 @@ return [push.trial.success, push.past.map((s) => [s.twist.v_x, s.twist.v_y, s.tw
 """
 SINGLE_STEPS = """
 const push = new Push({ law: arguments[0], task: arguments[2], target: [-1, 0], heading: 0.8 });
-return arguments[1].map(([trial, memory]) => {
+return JSON.parse(arguments[1]).map(([trial, memory]) => {
   Object.assign(push, { trial, memory });
   push.step();
   const { twist } = push.sample;
@@ -74,7 +74,8 @@ def twists(live):
 BASE_OF = {law: base for base, laws in MAKE["LAWS"].items() for law in laws}
 
 
-@pytest.mark.parametrize("law", ["rps_plus", slow("rps_tuned"), "unicycle", slow("unicycle_car")])
+# The other bases; below, a base that moves sideways takes single steps.
+@pytest.mark.parametrize("law", ["unicycle", *map(slow, ("rps_plus", "rps_tuned", "unicycle_car"))])
 def test_a_whole_push_has_the_twists_of_python(law, browser):
     with python_push(law, robot=MAKE["BASES"][BASE_OF[law]][1]) as live:
         expected = twists(live)
@@ -252,8 +253,8 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
         memories = leaves_by_name([step.law_state for step in previous])
         states = list(zip(trials, memories, strict=True))
         next_qpos = np.array([live.past[i + 1].snapshot.qpos for i in shown])
-    batches = [states[i : i + 500] for i in range(0, len(states), 500)]
-    computed = np.concatenate([browser.execute_script(SINGLE_STEPS, law, x, task) for x in batches])
+    # As text: the driver converts each number of an argument by itself.
+    computed = np.array(browser.execute_script(SINGLE_STEPS, law, json.dumps(states), task))
     assert_allclose(computed[:, :3], expected[list(shown)], rtol=0, atol=1e-5)
     assert_allclose(computed[:, 3:], next_qpos, rtol=0, atol=1e-7)
 

@@ -22,6 +22,10 @@ SMALL = (160, 120)  # [px]
 FAR = (50.0, 50.0)  # [m] a target out of sight
 NOWHERE = (np.nan, np.nan)
 PLAIN = {"p_world_target": FAR, "size": SMALL}
+every_camera = pytest.mark.parametrize("camera", ["above", "oblique"])
+on_linux = pytest.mark.skipif(
+    sys.platform != "linux", reason="elsewhere MuJoCo needs no choice of GL"
+)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +93,7 @@ def test_the_contact_point_leaves_a_path_with_gaps(box, tmp_path):
     assert 0 < len(changed(blank, gap)) < len(changed(blank, whole))
 
 
-@pytest.mark.parametrize("camera", ["above", "oblique"])
+@every_camera
 def test_a_partially_redrawn_image_equals_the_whole_image(box, camera):
     options = {"p_world_target": (1.0, 1.0), "size": (320, 180), "camera": camera}
     frames = np.tile(scene.initial_qpos(box), (6, 1))
@@ -129,7 +133,7 @@ def test_above_is_a_map_with_x_up_and_y_left(box):
     assert column == pytest.approx(160 - 2.0 * metre, abs=3)
 
 
-@pytest.mark.parametrize("camera", ["above", "oblique"])
+@every_camera
 def test_the_camera_follows_a_base_that_drives_away(box, camera):
     options = {"p_world_target": FAR, "size": (320, 180), "camera": camera}
     poses = np.tile(scene.initial_qpos(box), (4, 1))
@@ -140,7 +144,7 @@ def test_the_camera_follows_a_base_that_drives_away(box, camera):
     assert len(changed(far, without)) > 0.7 * len(changed(near, ground)) > 50
 
 
-@pytest.mark.parametrize("camera", ["above", "oblique"])
+@every_camera
 def test_both_cameras_see_targets_on_all_sides(box, camera):
     qpos = scene.initial_qpos(box)
     for target in itertools.product((-2.5, 2.5), repeat=2):
@@ -216,9 +220,12 @@ def python(code):
     return subprocess.run(command, capture_output=True, text=True, check=True)
 
 
-def test_without_rendering_the_check_names_the_fix(monkeypatch):
+def test_an_import_changes_nothing_and_without_rendering_the_check_names_the_fix(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
-    done = python("from rps_jax.world import video; print(video.check())")
+    done = python(
+        "import os, sys; before = dict(os.environ); from rps_jax.world import video; "
+        "assert 'mujoco' not in sys.modules and before == dict(os.environ); print(video.check())"
+    )
     assert "apt install libegl1" in done.stdout
     assert done.stderr == ""
 
@@ -233,7 +240,7 @@ def test_no_renderer_is_made_without_a_context(monkeypatch):
         rendering.check_rendering()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere MuJoCo needs no choice of GL")
+@on_linux
 def test_an_egl_that_does_not_work_is_no_fault_of_the_users_variables(monkeypatch):
     for name in ("MUJOCO_GL", "DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -244,20 +251,13 @@ def test_an_egl_that_does_not_work_is_no_fault_of_the_users_variables(monkeypatc
     assert "'MUJOCO_GL'" not in done.stdout
 
 
-def test_importing_the_module_changes_nothing():
-    python(
-        "import os, sys; before = dict(os.environ); import rps_jax.world.video; "
-        "assert 'mujoco' not in sys.modules and before == dict(os.environ)"
-    )
-
-
 def test_an_existing_choice_of_gl_is_respected(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     rendering.choose_gl.__wrapped__()
     assert os.environ["MUJOCO_GL"] == "osmesa"
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere MuJoCo needs no choice of GL")
+@on_linux
 def test_rendering_works_without_a_display_after_importing_mujoco(monkeypatch):
     for name in ("MUJOCO_GL", "DISPLAY"):
         monkeypatch.delenv(name, raising=False)

@@ -65,10 +65,9 @@ def p_robot_object(snapshot):
     return np.array([[c, s], [-s, c]]) @ (snapshot.qpos[3:5] - snapshot.qpos[:2])
 
 
-LAWS = ["rps,K_h=0.3", "rps,tuned.json", "mine.py:PParams,v=0.04", "policy.npz"]
-
-
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    "law", ["rps,K_h=0.3", "rps,tuned.json", "mine.py:PParams,v=0.04", "policy.npz"]
+)
 def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries):
     """Laws are given by name with changes, as tuned parameters, as a user's file, or learned."""
     monkeypatch.chdir(tmp_path)
