@@ -48,7 +48,6 @@ STALE: dict[str, str] = {
     "tasks_parity": "objects got supports, with other last bits of C MuJoCo",
     "plus": "the ladder, whose small run tells of changes, got more laws",
     "export_paper": "exported code tests the bits of numbers for NaN",
-    "fit_one_push": "a sum in the solver got its former order back, with other last bits",
 }
 NUMBERS = SWEEPS / "publish" / "numbers.json"
 _NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
