@@ -47,7 +47,6 @@ STALE: dict[str, str] = {
     ),
     "tasks_parity": "objects got supports, with other last bits of C MuJoCo",
     "plus": "the ladder, whose small run tells of changes, got more laws",
-    "export_paper": "exported code tests the bits of numbers for NaN",
 }
 NUMBERS = SWEEPS / "publish" / "numbers.json"
 _NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
