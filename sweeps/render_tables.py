@@ -41,10 +41,6 @@ _CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
 _TEXT_CELL = re.compile(r"^(# %% \[markdown\]\n)((?:#.*\n)*)", re.MULTILINE)  # of notebooks' texts
 # The change since each stale data file: what follows "Computed before".
 STALE: dict[str, str] = {
-    **dict.fromkeys(
-        ("fit_methods", "fit_methods_quantities"),
-        "tuners got separate worlds, which no sweep meets",
-    ),
     "tasks_parity": "objects got supports, with other last bits of C MuJoCo",
     "plus": "the ladder, whose small run tells of changes, got more laws",
 }
