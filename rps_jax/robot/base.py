@@ -77,11 +77,10 @@ def observe_pose(
     """
     if not poses.shape[0]:
         return poses, pose
-    poses = jnp.concatenate([pose[None], poses[:-1]])
-    delayed = poses[steps_of(odometry.pose_latency, period)]
+    poses, late = delayed(poses, pose, odometry.pose_latency, period)
     noise = jax.random.fold_in(jax.random.fold_in(key, _ODOMETRY), steps)
     sigma = jnp.stack([odometry.pose_noise] * 2 + [odometry.yaw_noise])
-    return poses, delayed + sigma * normal(noise, (3,), pose.dtype)
+    return poses, late + sigma * normal(noise, (3,), pose.dtype)
 
 
 def low_pass(old: Array, new: Array, period: Scalar, time_constant: Number) -> Array:
@@ -94,9 +93,13 @@ def normal(key: Array, shape: tuple[int, ...], dtype: DTypeLike) -> Array:
     return jax.random.normal(key, shape, jnp.float32).astype(dtype)
 
 
-def steps_of(time: Number, period: float) -> Array:
-    """Return the number of control steps of `period` [s] in a time [s]."""
-    return jnp.round(time / period).astype(jnp.int32)
+def delayed(latest: Array, new: Array, delay: Number, period: float) -> Pair:
+    """Return the latest values (K, n), `new` (n,) first, and the value (n,) a delay [s] before.
+
+    There is a value for each control step of `period` [s].
+    """
+    latest = jnp.concatenate([new[None], latest[:-1]])
+    return latest, latest[jnp.round(delay / period).astype(jnp.int32)]
 
 
 # --- the load ------------------------------------------------------------------------------

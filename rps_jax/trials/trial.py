@@ -359,10 +359,10 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     Both twists are in the robot frame; `period` [s] is the control period.
     """
     if trial.twists.shape[0]:
-        twists = jnp.concatenate([jnp.stack(twist)[None], trial.twists[:-1]])
-        delayed = twists[base.steps_of(world.odometry.command_delay, period)]
-        delayed = base.apply_errors(world.robot, delayed, world.odometry.velocity_error)
-        trial, twist = trial._replace(twists=twists), Twist(*delayed)
+        delay = world.odometry.command_delay
+        twists, late = base.delayed(trial.twists, jnp.stack(twist), delay, period)
+        late = base.apply_errors(world.robot, late, world.odometry.velocity_error)
+        trial, twist = trial._replace(twists=twists), Twist(*late)
     if world.robot is None or trial.drive is None:
         return trial, twist
     aim = base.aim(world.robot, trial.drive.aim, jnp.stack(twist), period)
