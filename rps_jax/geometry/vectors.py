@@ -86,16 +86,16 @@ def norm(a: Sequence[Number], least: float = 1e-12) -> Number:
     return jnp.sqrt(jnp.maximum(dot(a, a), least * least))
 
 
-def turned(by: Point, a: V) -> V:
+def turned(rotation: Point, a: V) -> V:
     """Rotate x and y of a vector by an angle, given by its cosine and sine."""
-    (c, s), (x, y, *rest) = by, a
+    (c, s), (x, y, *rest) = rotation, a
     entries: Any = c * x - s * y, s * x + c * y, *rest
     return entries
 
 
-def turned_back(by: Point, a: V) -> V:
+def turned_back(rotation: Point, a: V) -> V:
     """Rotate x and y of a vector by minus an angle, given by its cosine and sine."""
-    (c, s), (x, y, *rest) = by, a
+    (c, s), (x, y, *rest) = rotation, a
     entries: Any = c * x + s * y, c * y - s * x, *rest
     return entries
 
