@@ -121,10 +121,13 @@ def laws_for(drive: DriveKind) -> list[str]:
     return [name for name, law in laws.items() if drive in law.drives and not law.heading]
 
 
-def check_task(params: LawParams, task: str, room: float, follows: bool) -> None:
+def check_task(
+    params: LawParams, task: str, room: float, wider: Sequence[str], follows: bool
+) -> None:
     """Raise InputError unless a law suits a task.
 
-    This leaves it `room` [m] around the object, and its target moves if the law `follows` it.
+    This leaves it `room` [m] around the object, more with greater values of its options `wider`,
+    and its target moves if the law `follows` it.
     """
     law, rule = law_of(params), ""
     if follows and law.heading and not law.follows:
@@ -134,8 +137,9 @@ def check_task(params: LawParams, task: str, room: float, follows: bool) -> None
         rule += "heading=... for the path's end"
     elif law.room > room:
         rule = f"its detours need {law.room:g} m without walls around the object, not {room:g} m; "
-        rule += "choose another law, a corridor of a greater width=... (twice that), or rooms of a "
-        rule += "greater base_radius=... and object_radius=..."
+        rule += "choose another law"
+        if wider:
+            rule += f", or give the task a greater {' or '.join(wider)}"
     if rule:
         raise errors.not_allowed("task", f"{task} with the law {_name_of(params)}", rule)
 

@@ -135,7 +135,7 @@ class Setting:
         self.check_here(domain.weakest, laws)
         for params in laws:
             task, follows = domain.task, not domain.task.HAS_TARGET
-            registry.check_task(params, task.kind, task.free_room, follows)
+            registry.check_task(params, task.kind, task.free_room, task.ROOM_OPTIONS, follows)
 
     def to_json(self) -> JsonObject:
         """Return the setting as manifests have it; `from_json` reads it."""

@@ -103,6 +103,7 @@ class Task:
     kind: str = ""  # name of the task
     OUTCOMES: ClassVar[Mapping[str, Spec]] = {}  # those that it adds, by name
     HAS_TARGET: ClassVar[bool] = False  # whether trials end at the domain's targets
+    ROOM_OPTIONS: ClassVar[tuple[str, ...]] = ()  # greater ones leave more `free_room`
     # Names of which one identifies a mapping without a kind; `read` turns them into fields.
     MARKS: ClassVar[tuple[str, ...]] = ()
     NUMBERS: ClassVar[tuple[str, ...]] = ()  # names of random numbers without a range

@@ -213,6 +213,7 @@ class Corridor(Path):
     """Follow a path between walls."""
 
     kind: str = "corridor"
+    ROOM_OPTIONS = ("width",)
     OUTCOMES: ClassVar[Mapping[str, Spec]] = {
         **Path.OUTCOMES,
         "clearance": Spec(

@@ -61,6 +61,7 @@ class Rooms(Following):
 
     kind: str = "rooms"
     OUTCOMES = Corridor.OUTCOMES
+    ROOM_OPTIONS = ("base_radius", "object_radius")
     FAILURES = Corridor.FAILURES
     MARKS = ("polygons", "outline", *_ROS, "tolerance", "specks", "crop", *_IGNORED)
     NUMBERS = ("route",)
