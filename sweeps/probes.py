@@ -31,6 +31,7 @@ Record: TypeAlias = dict[str, Any]  # processor, versions, variables: digest, me
 
 FILE = Path(__file__).with_name("publish") / "probes.json"
 TOLERANCE = 0.05  # of the root mean square of a variable, on another processor
+_ROUNDING = 1e-6  # root mean square below which a variable is rounding, in any unit
 _SWEEPS = Path(__file__).parent
 _PACKAGES = ("jax", "mujoco", "numpy")
 # Measured variables of results; with a slash, those of one probe.
@@ -172,7 +173,7 @@ def same(record: Record, today: Record) -> bool:
         digests = {row[0] for row in current.values()}
         return all(row[0] in digests for row in recorded.values())
     return recorded.keys() <= current.keys() and all(
-        abs(a - b) <= TOLERANCE * max(size, 1e-6)
+        abs(a - b) <= TOLERANCE * max(size, _ROUNDING)
         for name, (_, *row, size) in recorded.items()
         for a, b in zip((*row, size), current[name][1:], strict=True)
     )

@@ -490,7 +490,8 @@ int main(void) {
 }
 """
 SANE = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-COMPILERS = tuple(name for name in ("gcc", "clang") if shutil.which(name))
+ALL_COMPILERS = "gcc", "clang"
+COMPILERS = tuple(name for name in ALL_COMPILERS if shutil.which(name))
 
 
 class Fuzzed(NamedTuple):

@@ -318,7 +318,7 @@ def _odd_table(results: xr.Dataset) -> Table:
         cells = [f"{n:,}" for n in (sum(counts), *counts[1:])]
         rows.append([row["law"], row["compiler"], *cells, "0"])
     note = "A fault would have ended the run without a table. Both precisions are counted together."
-    if missing := {"gcc", "clang"} - set(results.compiler.values):
+    if missing := [x for x in native.ALL_COMPILERS if x not in results.compiler.values]:
         note += f" Not installed, so not tested: {', '.join(missing)}."
     return Table(rows, note, title="Odd inputs")
 
