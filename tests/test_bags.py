@@ -17,6 +17,7 @@ from helpers import (
     refusing,
     rps,
     setting_of,
+    slow,
 )
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -42,7 +43,7 @@ def recorded(tmp_path_factory):
     return path, trace
 
 
-LAWS = ("rps_plus", "learned_small", "aps", "force_push_published")
+LAWS = ("rps_plus", "learned_small", slow("aps"), "force_push_published")
 
 
 @pytest.mark.parametrize("law", LAWS)

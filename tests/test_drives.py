@@ -4,13 +4,14 @@ import json
 import math
 import shlex
 from dataclasses import replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ROOT, diagonal, observation, refusals, refusing
+from helpers import ROOT, observation, refusals, refusing, slow
 
 from rps_jax import draw_worlds, engines, rollout
 from rps_jax.app.cli import flags, names
@@ -43,7 +44,9 @@ BASES = {
     "car": replace(CAR, lag=0.2),
     "car with traction": replace(CAR, traction=0.5),
 }
-AXLES = diagonal([*BASES], engines.names()[::-1])  # a limited force is not for the planar engine
+QUICK_AXLES = list(zip(BASES, ("quasistatic", "mujoco", "fused", "fused"), strict=True))
+# A limited force is not for the planar engine.
+AXLES = [x if x in QUICK_AXLES else slow(*x) for x in product(BASES, engines.names())]
 
 
 class Weave(NamedTuple):

@@ -160,7 +160,7 @@ def test_the_reference_of_a_turn_is_the_first_flush_face():
 
 def test_the_law_finds_a_relative_heading_by_a_flush_face():
     """Equal pushes: straight ahead until the face is flush, then as with the absolute heading."""
-    setting = Setting("quasistatic", rules=Rules(horizon=250.0))
+    setting = Setting(rules=Rules(horizon=250.0))
     case = {"law": FAST, "target": (1.2, 0.5), "setting": setting}
     trace = rps_jax.push(task="pose,turn=1.57", **case)
     assert trace.outcome.success
@@ -310,6 +310,7 @@ def test_an_environment_has_the_heading_of_the_goal_and_the_ends():
 # --- the law -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_law_delivers_boxes_to_poses_and_ends_each_trial():
     setting = Setting(rules=Rules(horizon=300.0), split="tune")
     domain = "wide,objects=random_box"
@@ -579,6 +580,7 @@ def test_a_path_without_a_heading_has_neither_its_number_nor_its_outcomes():
     assert plain.shape != posed.shape
 
 
+@pytest.mark.slow
 def test_the_law_of_paths_delivers_boxes_to_the_pose_at_the_end():
     free = "pose.v_free=0.2,pose.omega_free=0.5"
     setting = Setting(rules=Rules(horizon=500.0), split="tune")

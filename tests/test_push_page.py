@@ -1,16 +1,16 @@
 """The interactive push page computes the same twists as Python."""
 
-import contextlib
 import itertools
 import json
 import math
 import runpy
+from typing import Any, NamedTuple
 
 import chromium
 import jax
 import numpy as np
 import pytest
-from helpers import ROOT, slow
+from helpers import ROOT, row, slow
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from selenium.webdriver.common.action_chains import ActionChains
@@ -19,12 +19,13 @@ from shapely import LineString, Point
 
 from rps_jax.geometry import solid
 from rps_jax.lowering.routine import fields_of
-from rps_jax.trials import pushes
+from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
-from rps_jax.trials.live import Live
 from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import ControlLoop, Outcome, Snapshot
 
 MAKE = runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))
+STEPS = 7500  # of a trial
 WHOLE_PUSH = """
 const push = new Push({ law: arguments[0], shape: arguments[1], target: [-1, 0] });
 while (push.step()) {}
@@ -55,30 +56,46 @@ def browser(tmp_path_factory):
         assert not browser.get_log("browser")
 
 
-@contextlib.contextmanager
-def python_push(law, **options):
-    """The paper's push to (-1, 0) m, or in a task, in double precision."""
+class Python(NamedTuple):
+    """A push in Python: trials and snapshots before each step, and the outcome."""
+
+    trials: list[Any]
+    snapshots: Snapshot  # (T, ...)
+    outcome: Outcome
+
+    @property
+    def twists(self):
+        return np.stack(self.snapshots.twist, axis=-1)
+
+
+def python_push(law, target=(-1.0, 0.0), **options):
+    """Return the paper's push, by default to (-1, 0) m, or in a task, in double precision."""
+    setting = Setting("quasistatic")
     with jax.enable_x64(True):
-        setting = Setting("quasistatic")
-        case = Case("box", "S1", (-1.0, 0.0), law, **options)
-        live = Live(pushes.build([case], setting), setting)
-        live.step(20_000)
-        assert live.done
-        yield live
+        worlds = pushes.build([Case("box", "S1", target, law, **options)], setting)
+        loop = ControlLoop(setting.physics, setting.rules, worlds.law)
 
+        @jax.jit
+        def run(inputs):
+            start = trial.start_all(*inputs, np.ones(1, bool), law=loop.law)
+            options = {"loop": loop, "steps": STEPS, "states": True}
+            last, steps = trial.unroll(worlds.stage, *inputs, start, **options)
+            return start, steps, trial.outcome(last, inputs[0], loop)
 
-def twists(live):
-    return np.array([np.stack(step.snapshot.twist) for step in live.past])
+        start, (snapshots, trials), outcome = jax.device_get(run(worlds.inputs))
+    assert trials.done[-1].all()
+    count = 1 + int(np.argmax(trials.done[:, 0]))
+    states = [row(start, 0), *(row(trials, (i, 0)) for i in range(count - 1))]
+    return Python(states, row(snapshots, np.s_[:count, 0]), row(outcome, 0))
 
 
 BASE_OF = {law: base for base, laws in MAKE["LAWS"].items() for law in laws}
 
 
-# The other bases; below, a base that moves sideways takes single steps.
-@pytest.mark.parametrize("law", ["unicycle", *map(slow, ("rps_plus", "rps_tuned", "unicycle_car"))])
+@pytest.mark.slow  # below, a push takes single steps
+@pytest.mark.parametrize("law", ["rps_plus", "rps_tuned", "unicycle", "unicycle_car"])
 def test_a_whole_push_has_the_twists_of_python(law, browser):
-    with python_push(law, robot=MAKE["BASES"][BASE_OF[law]][1]) as live:
-        expected = twists(live)
+    expected = python_push(law, robot=MAKE["BASES"][BASE_OF[law]][1]).twists
     assert expected.dtype == np.float64
     success, computed = browser.execute_script(WHOLE_PUSH, law, "box")
     assert success
@@ -121,9 +138,8 @@ def test_a_task_has_the_outcomes_of_python(kind, width, door, touched, browser):
     task = {"kind": kind, "waypoints": ROUTE, "lookahead": 1.6}
     if kind == "corridor":
         task |= {"width": width, "doors": 1, "door_width": door}
-    with python_push("rps", task=task) as live:
-        expected, steps = live.outcome, int(live.past[-1].trial.steps)
-        last = np.stack(live.past[-1].snapshot.twist)
+    in_python = python_push("rps", task=task)
+    expected, steps, last = in_python.outcome, len(in_python.trials), in_python.twists[-1]
     count, who, outcomes, twist = browser.execute_script(IN_A_TASK, kind, ROUTE, width, door)
     assert (who, bool(expected.success)) == (touched, not touched)
     assert abs(count - steps) <= 1
@@ -245,18 +261,16 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
     """
     task = "pose" if law == "pose" else "reach"
     options = {"task": "pose,heading=0.8"} if law == "pose" else {}
-    with python_push(law, **options) as live:
-        expected, stride = twists(live), max(1, len(live.past) // 3000)
-        shown = range(0, len(live.past) - 1, stride)
-        previous = [live.past[i].trial for i in shown]
-        trials = leaves_by_name([step._replace(**MAKE["UNTRACED"]) for step in previous])
-        memories = leaves_by_name([step.law_state for step in previous])
-        states = list(zip(trials, memories, strict=True))
-        next_qpos = np.array([live.past[i + 1].snapshot.qpos for i in shown])
+    push = python_push(law, **options)
+    shown = np.arange(0, len(push.trials) - 1, max(1, len(push.trials) // 800))
+    previous = [push.trials[i] for i in shown]
+    trials = leaves_by_name([step._replace(**MAKE["UNTRACED"]) for step in previous])
+    memories = leaves_by_name([step.law_state for step in previous])
+    states = list(zip(trials, memories, strict=True))
     # As text: the driver converts each number of an argument by itself.
     computed = np.array(browser.execute_script(SINGLE_STEPS, law, json.dumps(states), task))
-    assert_allclose(computed[:, :3], expected[list(shown)], rtol=0, atol=1e-5)
-    assert_allclose(computed[:, 3:], next_qpos, rtol=0, atol=1e-7)
+    assert_allclose(computed[:, :3], push.twists[shown], rtol=0, atol=1e-5)
+    assert_allclose(computed[:, 3:], push.snapshots.qpos[shown + 1], rtol=0, atol=1e-7)
 
 
 def leaves_by_name(trees):
