@@ -18,8 +18,7 @@ from helpers import rps as command
 from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
-from rps_jax import RPSParams, Rules, Setting
-from rps_jax.app.viewer import View
+from rps_jax import RPSParams, Rules
 from rps_jax.control.laws import guided, rps
 from rps_jax.control.laws.guided import GuidedParams
 from rps_jax.control.laws.rps import RPSState
@@ -165,25 +164,6 @@ def test_the_first_worlds_and_common_failures_are_tried(monkeypatch):
     assert worlds("a", sample=0, most=2) == [0, 1]
     with refusing("unknown law of the run 'c'"):
         worlds("c", sample=0)
-
-
-@pytest.mark.parametrize("command_type", [Ceiling, View])
-def test_a_run_has_its_own_robot_and_setting(command_type, monkeypatch):
-    monkeypatch.setattr(ceiling, "load_plan", lambda path: None)
-    refused = {
-        "robot = turtlebot4": {"robot": "turtlebot4"},
-        "horizon = 4.0": {"setting": Setting(rules=Rules(horizon=4.0))},
-        "seed = 3": {"setting": Setting(seed=3)},
-    }
-    for message, options in refused.items():
-        with refusing(f"{message} is not allowed: the run has its own"):
-            command_type(run="run", **options).check()
-
-
-def test_a_run_of_another_command_is_refused(tmp_path):
-    (tmp_path / "manifest.json").write_text("{}")
-    with refusing("does not hold a sweep"):
-        rps_jax.ceiling(run=tmp_path)
 
 
 @pytest.mark.slow
