@@ -31,7 +31,7 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, load_plan, scene_of, world_title
 from rps_jax.runs.push import case_options, end_in_words, program_slots, select_law
-from rps_jax.runs.question import Command, call_of, refuse_options, suit_robot
+from rps_jax.runs.question import Command, call_of, suit_robot
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.live import CHUNK, Live, yaw_target
@@ -98,7 +98,7 @@ class View(Command[None], Case):
         self.setting.check_here(self.case.base, [self.case.params])
         self.setting.simulator.check_traced()
         if self.run is not None:
-            refuse_options(self, [x.name for x in dataclasses.fields(Case) if x.name != "law"])
+            self.refuse_options([x.name for x in dataclasses.fields(Case) if x.name != "law"])
             self._chosen(self.run)
 
     def num_trials(self) -> int:

@@ -183,6 +183,18 @@ class Command(Generic[T]):
         """Execute the command with valid options."""
         raise NotImplementedError
 
+    def refuse_options(self, names: Sequence[str]) -> None:
+        """Raise InputError for options, or numbers of the setting, that a run determines."""
+
+        def values(source: Any, setting: Setting) -> dict[str, Any]:
+            own = {name: getattr(source, name) for name in names} | vars(setting)
+            return own | own.pop("rules")._asdict()
+
+        defaults = values(type(self), Setting())
+        for name, value in values(self, self._setting or Setting()).items():
+            if value is not defaults[name] and value != defaults[name]:
+                raise errors.not_allowed(name, value, "the run has its own; omit it")
+
     # --- for callers -----------------------------------------------------------------------
 
     def __call__(self) -> T:
@@ -430,19 +442,6 @@ def suit_robot(command: Any, robot: RobotLike | None, task: Task | None = None) 
         object.__setattr__(command, "law", suited[0])
     if isinstance(laws, DefaultLaws) and (suited := suited_laws(base, task, laws)) != laws:
         object.__setattr__(command, "laws", suited)
-
-
-def refuse_options(command: Any, names: Sequence[str]) -> None:
-    """Raise InputError if options are named, or numbers of the setting, that a run determines."""
-
-    def values(source: Any, setting: Setting) -> dict[str, Any]:
-        own = {name: getattr(source, name) for name in names} | vars(setting)
-        return own | own.pop("rules")._asdict()
-
-    defaults = values(type(command), Setting())
-    for name, value in values(command, command.setting).items():
-        if value is not defaults[name] and value != defaults[name]:
-            raise errors.not_allowed(name, value, "the run has its own; omit it")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,7 +32,7 @@ from rps_jax.questions import Plan, Run, Section, call_of, option
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.runs.plan import attributes_of, load_plan
-from rps_jax.runs.question import DomainQuestion, Rows, count_true, refuse_options
+from rps_jax.runs.question import DomainQuestion, Rows, count_true
 from rps_jax.studies.gallery import failure_modes
 from rps_jax.trials import score
 from rps_jax.trials.batch import outcomes
@@ -122,7 +122,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     def check(self) -> None:
         if self.run is not None:
             load_plan(Path(self.run))  # refuses other runs than sweeps
-            refuse_options(self, ("domain", "robot", "task"))
+            self.refuse_options(("domain", "robot", "task"))
         if not self.world_indices.size:
             raise errors.not_allowed("sample", self.sample, "no world would be tried")
         replace(self, domain=self.plan.domain, setting=self.plan.setting, run=None).check_engine()
