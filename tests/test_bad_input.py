@@ -123,6 +123,7 @@ COMMANDS = {
         "--fidelity best": unlike("--fidelity", "best", "reference", "standard", "fast"),
     },
     "push": {
+        "--bag push.txt": "bag = push.txt is not allowed: name a file, as push.mcap",
         "--target 0 0": "target = .* outside the robot",
         "--target 1": "target",
         "--mass heavy": "heavy",
@@ -183,7 +184,13 @@ COMMANDS = {
         "run x": "world = x is not allowed: give a whole number",
         "run -1": "world = -1 is not allowed: it must be a whole number from 0 to",
     },
+    "ceiling": {
+        "lacking": "run = lacking does not hold a sweep: give the folder of",
+        "run --robot turtlebot4": "robot = turtlebot4 is not allowed: the run has its own",
+        "run --horizon 4": "horizon = 4.0 is not allowed: the run has its own",
+    },
     "view": {
+        "run --seed 3": "seed = 3 is not allowed: the run has its own",
         "--engine mujoco": "engine = mujoco is not allowed: JAX must trace it; choose fused,",
         "--port http": "http",
     },

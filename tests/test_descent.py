@@ -290,7 +290,9 @@ def test_the_record_of_a_run_has_a_custom_optimiser():
 
 
 def test_optimisers_are_those_of_optax_and_one_that_needs_more_is_refused():
-    assert {"adam", "adamw", "sgd", "lion", "fixed_length"} <= set(optimisers.optimisers())
+    known = set(optimisers.optimisers())
+    assert {"adam", "adamw", "sgd", "lion", "fixed_length"} <= known
+    assert not [name for name in known if name.startswith(("_", "scale_by"))]
     for name in optimisers.SCHEDULES:
         rule = optimisers.optimiser("sgd", name, 0.1, 20)
         change, _ = rule.update(jnp.ones(3), rule.init(jnp.zeros(3)), jnp.zeros(3))

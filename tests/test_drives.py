@@ -442,6 +442,12 @@ def test_calls_of_the_library_take_the_period_of_the_robot():
     assert rollout(world, law, batch.stage, horizon=0.5).time.shape == (5,)
 
 
+def test_a_rollout_refuses_a_law_that_the_base_cannot_follow():
+    batch = draw_worlds("wide,objects=random_cylinder", robot="turtlebot4")
+    with refusing("law = rps is not allowed: it moves sideways"):
+        jax.vmap(lambda world: rollout(world, registry.LAWS["rps"], batch.stage))(batch.worlds)
+
+
 @pytest.mark.parametrize("following", ["sweep", "ladder"])
 @pytest.mark.parametrize(
     "name", [x for x in COMMANDS if hasattr(names.question_type(x), "next_command")]

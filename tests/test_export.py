@@ -79,6 +79,12 @@ def test_a_law_in_c_agrees_with_jax(name, tmp_path):
         assert result.beyond < 200
 
 
+@pytest.mark.parametrize("words", ["unicycle_round round", "pose_narrow turtlebot4"])
+def test_a_law_of_a_round_or_narrow_base_agrees_with_jax(words, tmp_path):
+    law, robot = words.split()
+    assert agreement(law, "double", 1000, tmp_path, robot=robot).unexplained == 0
+
+
 def test_a_law_of_a_base_with_an_axle_agrees_with_jax(tmp_path):
     law, robot = DRIVEN.split()
     for form, most in (("double", 10), ("onnx", 200)):

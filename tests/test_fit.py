@@ -495,3 +495,10 @@ def test_methods_are_compared_on_the_logs_that_all_fit():
     everything = [("neural", "4", "100.0 %"), ("gradient", "4", "100.0 %")]
     common = [(method, "2", "100.0 %") for method in methods.METHODS]
     assert counts == everything + common
+
+
+def test_statistics_that_no_world_has_are_left_out():
+    values = np.array([[[1.0, np.nan, 1.0]]])
+    names = {"statistic": ["base/a", "base/b", "signal/c"]}
+    bank = xr.Dataset({"statistics": (("world", "way", "statistic"), values)}, names)
+    assert fit.statistic_names(bank, ()) == ["base/a"]

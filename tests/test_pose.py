@@ -17,6 +17,7 @@ from rps_jax.control import registry
 from rps_jax.control.box import Box, feel
 from rps_jax.control.laws.pose import PoseParams
 from rps_jax.control.observation import EndsObservation, Observation, PoseObservation
+from rps_jax.control.validation import check_law
 from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.quasistatic import Quasistatic, Slider
 from rps_jax.geometry import footprint as fp
@@ -193,6 +194,15 @@ def test_the_word_of_a_law_ends_a_trial(task, registries):
     assert float(outcome.time[0]) == pytest.approx(1.02, abs=0.021)
     assert not outcome.success.any()
     assert task == "reach" or outcome.task["declared"].all()
+
+
+@pytest.mark.parametrize(
+    ("word", "result"), [(lambda x: x[0], r"float32 \(\)"), (lambda x: x[0] > np.ones(3), "bool")]
+)
+def test_the_word_of_a_law_is_one_bool(word, result):
+    law = Law(lambda params: (jnp.zeros(()), NO), wait, is_done=word)
+    with refusing(f"is_done of the law in .* returns {result}.*: return one bool"):
+        check_law(law, WaitParams())
 
 
 CASES = {

@@ -98,6 +98,7 @@ class View(Command[None], Case):
         self.setting.check_here(self.case.base, [self.case.params])
         self.setting.simulator.check_traced()
         if self.run is not None:
+            self.refuse_options([x.name for x in dataclasses.fields(Case) if x.name != "law"])
             self._chosen(self.run)
 
     def num_trials(self) -> int:

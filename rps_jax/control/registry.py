@@ -176,7 +176,7 @@ def check_params(params: Params) -> Params:
         of their law do not return what a trial needs.
     """
     law = law_of(params)
-    validation.check_law(law.init, law.step, law.senses, params, heading=law.heading)
+    validation.check_law(law, params)
     law.check(params)
     return params
 

@@ -1,6 +1,6 @@
 """Checks of a custom law before anything compiles, with errors of one sentence.
 
-`check_law` traces `init` and `step` twice, which computes nothing. It compares the results with the
+`check_law` traces each function twice, which computes nothing. It compares the results with the
 types that a trial needs, and both traces with each other. Without it, a mistake in a law ends in a
 traceback through JAX, or a law that is not pure in results that depend on the compiler.
 """
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.control.base import LawParams, Senses, named_leaves
+from rps_jax.control.base import Law, LawParams, Senses, named_leaves
 from rps_jax.control.observation import (
     AnyObservation,
     Details,
@@ -70,20 +70,13 @@ def observation_shapes(
     return observations[senses]
 
 
-def check_law(
-    init: Function,
-    step: Function,
-    senses: Senses,
-    params: LawParams,
-    taxels: int = _TAXELS,
-    heading: bool = False,
-) -> None:
-    """Raise InputError unless `init` and `step` return what a trial needs on a robot.
+def check_law(law: Law, params: LawParams, taxels: int = _TAXELS) -> None:
+    """Raise InputError unless the functions of a law return what a trial needs on a robot.
 
     Laws of this package are not checked for the `taxels` of the paper's robot. A law is traced once
     for each form of its parameters.
     """
-    module = getattr(_unwrap(step), "__module__", None) or ""
+    module = getattr(_unwrap(law.step), "__module__", None) or ""
     if taxels == _TAXELS and module.startswith("rps_jax."):
         return
     for name, value in named_leaves(params, is_leaf=lambda x: x is None).items():
@@ -96,25 +89,17 @@ def check_law(
             raise not_allowed(f"params.{name}", repr(value), rule)
     leaves, tree = jax.tree.flatten(params)
     shapes = tuple(np.shape(leaf) for leaf in leaves)
-    _check_traced(init, step, senses, tree, shapes, taxels, heading)
+    _check_traced(law, tree, shapes, taxels)
 
 
 @functools.lru_cache(maxsize=256)
-def _check_traced(
-    init: Function,
-    step: Function,
-    senses: Senses,
-    tree: Pytree,
-    shapes: Sequence[tuple[int, ...]],
-    taxels: int,
-    heading: bool,
-) -> None:
-    """Trace both functions of a law, and compare their results with what a trial needs."""
-    dtype = jnp.result_type(float)
+def _check_traced(law: Law, tree: Pytree, shapes: Sequence[tuple[int, ...]], taxels: int) -> None:
+    """Trace the functions of a law, and compare their results with what a trial needs."""
+    dtype, step = jnp.result_type(float), law.step
     params = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes])
-    state = _trace("init", init, params)
+    state = _trace("init", law.init, params)
     name = "step" if taxels == _TAXELS else f"step, for a robot with {taxels} taxels,"
-    observation = observation_shapes(senses, taxels, heading)
+    observation = observation_shapes(law.senses, taxels, law.heading)
     results: Pytree = _trace(name, step, params, state, observation)
 
     def check(fault: str, expected: str) -> None:
@@ -136,6 +121,11 @@ def _check_traced(
             fault = "" if is_scalar else f"{group} whose {name} is {_describe(leaf)}"
             check(fault, "a real scalar")
     check(_difference(state, next_state), "the shapes and types that init returned")
+    if law.is_done is not None:
+        done = _describe(_trace("is_done", law.is_done, state))
+        if done != "bool ()":
+            function = f"is_done of the law in {_definition(law.is_done)}"
+            raise InputError(f"{function} returns {done}: return one bool, as state.phase > 2.")
 
 
 def _trace(name: str, function: Function, *args: object) -> object:
@@ -186,7 +176,9 @@ def _difference(state: object, next_state: object) -> str:
     leaves = zip(named_leaves(state).items(), jax.tree.leaves(next_state), strict=True)
     for (name, old), new in leaves:
         if _describe(old) != _describe(new):
-            return f"a state whose {name} is {_describe(new)}, and {_describe(old)} in init"
+            return (
+                f"a state whose {name or 'array'} is {_describe(new)}, and {_describe(old)} in init"
+            )
     return ""
 
 

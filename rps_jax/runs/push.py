@@ -186,6 +186,8 @@ class TraceQuestion(Question[Trace]):
     def check(self) -> None:
         if self.bag is not None:
             bags.check()
+            if files.suffix_of(self.bag) != ".mcap" or Path(self.bag).is_dir():
+                raise errors.not_allowed("bag", self.bag, "name a file, as push.mcap")
             folder.ensure_writable(Path(self.bag).parent)
 
     def record(

@@ -183,6 +183,18 @@ class Command(Generic[T]):
         """Execute the command with valid options."""
         raise NotImplementedError
 
+    def refuse_options(self, names: Sequence[str]) -> None:
+        """Raise InputError for options, or numbers of the setting, that a run determines."""
+
+        def values(source: Any, setting: Setting) -> dict[str, Any]:
+            own = {name: getattr(source, name) for name in names} | vars(setting)
+            return own | own.pop("rules")._asdict()
+
+        defaults = values(type(self), Setting())
+        for name, value in values(self, self._setting or Setting()).items():
+            if value is not defaults[name] and value != defaults[name]:
+                raise errors.not_allowed(name, value, "the run has its own; omit it")
+
     # --- for callers -----------------------------------------------------------------------
 
     def __call__(self) -> T:

@@ -120,8 +120,9 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         return Plan(sweep.domain, count, law, sweep.setting, points=sweep.points)
 
     def check(self) -> None:
-        if self.run is not None and self.task is not None:
-            raise errors.not_allowed("task", self.task, "the run has its own; omit it")
+        if self.run is not None:
+            load_plan(Path(self.run))  # refuses other runs than sweeps
+            self.refuse_options(("domain", "robot", "task"))
         if not self.world_indices.size:
             raise errors.not_allowed("sample", self.sample, "no world would be tried")
         replace(self, domain=self.plan.domain, setting=self.plan.setting, run=None).check_engine()

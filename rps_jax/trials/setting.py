@@ -125,8 +125,7 @@ class Setting:
             registry.check_drive(params, robot.drive)
             self.simulator.check_senses(law.senses)
             if law.senses in ("taxels", "ends"):
-                sizes = robot.shell.count, law.heading
-                check_law(law.init, law.step, law.senses, params, *sizes)
+                check_law(law, params, robot.shell.count)
 
     def check_domain(self, domain: Domain, laws: Iterable[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step the worlds of a domain with these laws."""

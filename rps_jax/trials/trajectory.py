@@ -127,7 +127,9 @@ def rollout(
       (3,)
     """
     check_arguments(rollout, locals())
-    setting = setting if world.robot is None else setting.with_robot(world.robot)
+    if world.robot is not None:
+        setting = setting.with_robot(world.robot)
+        registry.check_drive(params, world.robot.drive)
     engine = setting.simulator
     engine.check_traced()
     steps, loop = count_steps(horizon, setting), control_loop(params, setting, smooth=smooth)

@@ -322,7 +322,8 @@ def observe(
     is_lost = ~touch & (trial.contact_steps > 0)
     lost_steps = trial.lost_steps + is_lost
     absent_steps = jnp.where(is_lost, trial.absent_steps + 1, 0)
-    declared = None if loop.law.is_done is None else loop.law.is_done(trial.law_state)
+    is_done = loop.law.is_done
+    declared = None if is_done is None else jnp.asarray(is_done(trial.law_state))
     positions = positions_of(world, trial.qpos, reading.p_robot_contact, touch, declared)
     task, aim = world.task.step(trial.task, positions)
     aims = {"p_world_target": aim.p_world_target, "yaw_target": aim.yaw_target}

@@ -184,8 +184,8 @@ def soften_skins(worlds: World) -> World:
     """
     skin, shape = worlds.skin, jnp.shape(worlds.p_world_target)[:-1]
     if isinstance(skin, IdealSkin):
-        rule = "an ideal skin has no smooth form; choose skin=capacitive, or smooth=False"
-        raise errors.not_allowed("smooth", True, rule)
+        rule = "it has no smooth form; choose skin=capacitive, or in Python smooth=False"
+        raise errors.not_allowed("skin", "ideal", rule)
     if skin.temperature is not None:
         return worlds
     return worlds._replace(skin=skin._replace(temperature=jnp.full(shape, skin.SMOOTH)))

@@ -392,8 +392,9 @@ def coordinates(domain: Domain) -> tuple[str, ...]:
 
 
 def statistic_names(bank: xr.Dataset, fields: Sequence[str]) -> list[str]:
-    """Return the names of the statistics of logs with these optional fields."""
-    return [n for n in map(str, bank.statistic.values) if n.split("/")[0] in ("base", *fields)]
+    """Return the names of the statistics of logs with these optional fields that a world has."""
+    names = map(str, bank.dropna("statistic", how="all").statistic.values)
+    return [n for n in names if n.split("/")[0] in ("base", *fields)]
 
 
 def values_of(domain: Domain, u: np.ndarray) -> Arrays:

@@ -50,7 +50,8 @@ def optimisers() -> dict[str, Callable[..., optax.GradientTransformation]]:
     """Return `fixed_length` and the functions of optax whose first argument is a learning rate."""
     result: dict[str, Callable[..., optax.GradientTransformation]] = {"fixed_length": fixed_length}
     for name, function in inspect.getmembers(optax, inspect.isfunction):
-        if [*inspect.signature(function).parameters][:1] == ["learning_rate"]:
+        first = next(iter(inspect.signature(function).parameters), "")
+        if first == "learning_rate" and not name.startswith(("_", "scale_by")):
             result[name] = function
     return result
 

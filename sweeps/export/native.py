@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import Law, Observation, Robot, Twist
+from rps_jax import Law, Robot, Twist
 from rps_jax.app.export import folder, onnx_model, program
 from rps_jax.control import validation
 from rps_jax.laws import law_of, resolve_law
@@ -231,13 +231,14 @@ def agreement(
 ) -> Agreement:
     """Compare a law's twist and memory in C or ONNX and in JAX."""
     label, params = resolve_law(name)
-    law, exported, base = law_of(params), program.program(name, robot), Robot.parse(robot)
-    if base.drive != "omni":
+    exported, base = program.program(name, robot), Robot.parse(robot)
 
-        def step_of_base(params: Any, memory: Any, obs: Observation) -> Any:
-            return law_of(params).step(params, memory, obs.with_base(base.radius, base))
+    def step(params: Any, memory: Any, obs: Any) -> Any:
+        touch = getattr(obs, "touch", obs).with_base(base.radius, base)
+        obs = obs._replace(touch=touch) if hasattr(obs, "touch") else touch
+        return law_of(params).step(params, memory, obs)
 
-        law = replace(law, step=step_of_base)
+    law = replace(law_of(params), step=step)
     worlds, real = max(1, min(inputs // STEPS, 5000)), REAL[form]
     native = build_law(form, exported, path, worlds)
     with jax.enable_x64(form == "double"):

@@ -118,7 +118,7 @@ def parse_task(task: TaskLike) -> Task:
     known = {x.name: x for x in fields(kind)}
     values: dict[str, Any] = {}
     for name, value in task.items():
-        errors.check_name(f"task quantity of {kind.kind}", name, (*known, *kind.MARKS))
+        errors.check_name(f"task quantity of {kind.kind}", name, known | dict.fromkeys(kind.MARKS))
         if name == "kind" or name not in known:
             continue
         default: Any = known[name].default
