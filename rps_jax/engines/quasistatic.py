@@ -171,7 +171,7 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
     stiff = 1 / problem.speed
     if problem.pads is None:
         inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
-        gradient = sp.each(sp.mul, inertia, v)
+        gradient = sp.map_entries(sp.mul, inertia, v)
         hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in ENTRIES]
     else:
         gradient, hessian = friction_of_pads(problem.pads, v, _LEAST_PACE * problem.speed)
@@ -206,7 +206,7 @@ def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
         normal, point, gap = circle_and_base((corners[0][0], corners[1][0]), radius, size)
         points, gaps = [point], [gap]
     else:
-        ahead = sp.each(lambda x: jnp.roll(x, -1, axis=0), corners)
+        ahead = sp.map_entries(lambda x: jnp.roll(x, -1, axis=0), corners)
         normal, middles, gaps = polygon_and_base(corners, ahead, size)
         gaps = [gap - radius for gap in gaps]
         points = [sp.sub(q, sp.scale(0.5 * radius, normal)) for q in middles]

@@ -18,7 +18,7 @@ def friction_of_pads(pads: tuple[Number, ...], v: Vec, pace: Number) -> tuple[Ve
     speed = jnp.sqrt(sp.dot(u, u) + pace * pace)
     load, total = share / speed, sp.total(share * speed)
     flow = u[0], u[1], x * u[1] - y * u[0] + radius * u[2]
-    slope = sp.each(lambda f: sp.total(load * f), flow)
+    slope = sp.map_entries(lambda f: sp.total(load * f), flow)
     one = jnp.ones_like(x)
     metric = one, 0 * x, -y, one, x, x * x + y * y + radius * radius
     hessian: list[Number] = [

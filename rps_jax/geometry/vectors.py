@@ -41,7 +41,7 @@ def minus(a: Number, b: Number) -> Number:
     return a if isinstance(b, float) and b == 0.0 else a - b
 
 
-def each(function: Callable[..., Number], a: V, *others: Sequence[Number]) -> V:
+def map_entries(function: Callable[..., Number], a: V, *others: Sequence[Number]) -> V:
     """Apply a function to the entries of vectors."""
     entries: Any = tuple(map(function, a, *others))
     return entries
@@ -49,17 +49,17 @@ def each(function: Callable[..., Number], a: V, *others: Sequence[Number]) -> V:
 
 def add(a: V, b: V) -> V:
     """Return the sum of two vectors."""
-    return each(plus, a, b)
+    return map_entries(plus, a, b)
 
 
 def sub(a: V, b: V) -> V:
     """Return the difference of two vectors."""
-    return each(minus, a, b)
+    return map_entries(minus, a, b)
 
 
 def scale(s: Number, a: V) -> V:
     """Return a multiple of a vector."""
-    return each(partial(mul, s), a)
+    return map_entries(partial(mul, s), a)
 
 
 def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:

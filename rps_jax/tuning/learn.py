@@ -203,8 +203,8 @@ class Learn(PPO, DomainsQuestion):
         rows = [["update", "wall clock", "success in validation", "mean time", "curriculum"]]
         for update, row in validated.iterrows():
             wall, level = f"{row.time / 60:.1f} min", f"{100 * row.level:.0f} %"
-            rate, mean = share(row.validation), f"{row.validation_time:.0f} s".replace("nan s", "-")
-            rows.append([str(update), wall, rate, mean, level])
+            mean = f"{row.validation_time:.0f} s" if row.validation else "-"
+            rows.append([str(update), wall, share(row.validation), mean, level])
         picture = Picture("curve", partial(figure_of, results)) if results.sizes["update"] else None
         return [Section("Learning curve", text, rows, picture)]
 

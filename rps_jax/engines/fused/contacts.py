@@ -66,8 +66,8 @@ class Corners(NamedTuple):
     @classmethod
     def of(cls, at: Vec) -> Corners:
         """Return the corners of points (N, ...), counter-clockwise seen from above."""
-        back = sp.each(lambda x: x - jnp.roll(x, 1, axis=0), at)
-        ahead = sp.each(lambda x: jnp.roll(x, -1, axis=0), at)
+        back = sp.map_entries(lambda x: x - jnp.roll(x, 1, axis=0), at)
+        ahead = sp.map_entries(lambda x: jnp.roll(x, -1, axis=0), at)
         return cls(at, ahead, sp.dot(back, back) > 1e-12)  # type: ignore[arg-type]
 
 
@@ -300,7 +300,7 @@ def side_contacts(
     i = _index(2 * count, middle + 0 * normal[0])
     first = i % count == 0
     z = jnp.where(i < count, low, high)
-    point = sp.each(partial(jnp.where, first), points[0], points[-1])
+    point = sp.map_entries(partial(jnp.where, first), points[0], points[-1])
     gap = jnp.where(first, distances[0], distances[-1])
     distance = gap + sp.dot(slope, normal) * (z - middle)
     # The point is midway at the middle height.
@@ -314,7 +314,7 @@ def circle_and_base(
     if len(size) == 1:
         normal, _, distance = circle_and_base(centre, radius, (0.0, 0.0))
         return _on_circle(size[0], normal, distance - size[0])
-    nearest = sp.each(lambda x, h: jnp.clip(x, -h, h), centre, size)
+    nearest = sp.map_entries(lambda x, h: jnp.clip(x, -h, h), centre, size)
     offset = sp.sub(centre, nearest)
     gap = sp.norm(offset)
     outside = gap > 1e-6
@@ -341,7 +341,7 @@ def polygon_and_base(
     x, y = corners
     along = sp.sub(ahead, corners)
     length = sp.norm(along)
-    along = sp.each(lambda x: x / length, along)
+    along = sp.map_entries(lambda x: x / length, along)
     n = (along[1], -along[0])
     real = length > 1e-6
     if len(size) == 1:
@@ -382,7 +382,7 @@ def polygon_and_base(
     limits = [-offset / pace, (width - offset) / pace]
     low = jnp.clip(jnp.minimum(*limits), 0.0, extent)
     high = jnp.clip(jnp.maximum(*limits), 0.0, extent)
-    normal = sp.each(lambda x: jnp.where(by_base, x, -x), ref)
+    normal = sp.map_entries(lambda x: jnp.where(by_base, x, -x), ref)
     points, distances = [], []
     for t in (low, high):
         q = sp.add(p, sp.scale(t, edge))
@@ -407,7 +407,7 @@ def _polygon_and_circle(
     inside = sp.greatest(jnp.where(real, level, -_FAR)) < 0
     _, (q, n) = _best(jnp.where(real, -sp.dot(q, q), -_FAR), (q, n))
     gap = sp.norm(q)
-    normal = sp.each(lambda x, y: jnp.where(inside, -x, y / gap), n, q)
+    normal = sp.map_entries(lambda x, y: jnp.where(inside, -x, y / gap), n, q)
     normal, point, distance = _on_circle(radius, normal, jnp.where(inside, -gap, gap) - radius)
     return normal, [point], [distance]
 

@@ -157,8 +157,8 @@ class Problem(NamedTuple):
     ) -> Problem:
         """Return the problem of a state; `m` are the rows of the rotation of its principal axes."""
         i, w = body.inertia, state.w
-        torque = sp.cross(sp.each(sp.mul, i, w), w)  # - w x (I w)
-        free = sp.to_world(m, sp.each(operator.truediv, torque, i))
+        torque = sp.cross(sp.map_entries(sp.mul, i, w), w)  # - w x (I w)
+        free = sp.to_world(m, sp.map_entries(operator.truediv, torque, i))
         start = state.accelerations
         lift = (0.0, 0.0, GRAVITY) if body.gravity is None else sp.scale(-1, body.gravity)
         spin: Any = [
@@ -173,7 +173,7 @@ class Problem(NamedTuple):
         linear = sp.scale(self.mass, sp.add(a, self.lift))
         angular = sp.to_world(self.spin, sp.sub(alpha, self.free))
         inertia, force, tyres = self.base
-        rows = [sp.sub(sp.each(sp.mul, inertia, y), force) for y in b]
+        rows = [sp.sub(sp.map_entries(sp.mul, inertia, y), force) for y in b]
         if tyres is not None:
             excess = sp.dot(tyres.sideways, b[0]) - tyres.rest
             rows = [sp.add(rows[0], tyres.along(tyres.mass * excess))]
@@ -200,9 +200,12 @@ class Problem(NamedTuple):
             torque = sp.cross(c.r, f)
             if c.radius is not None:
                 torque = sp.add(torque, sp.scale(c.radius * force[3], c.n))
-            g[:2] = sp.sub(g[0], sp.each(sp.total, f)), sp.sub(g[1], sp.each(sp.total, torque))
+            g[:2] = (
+                sp.sub(g[0], sp.map_entries(sp.total, f)),
+                sp.sub(g[1], sp.map_entries(sp.total, torque)),
+            )
             if c.arm is not None:
-                g[2] = sp.add(g[2], sp.each(sp.total, sp.wrench(c.arm, f)))
+                g[2] = sp.add(g[2], sp.map_entries(sp.total, sp.wrench(c.arm, f)))
             _stiffen(h, c, k)
         return [entry for block in g for entry in block], h
 
@@ -278,7 +281,7 @@ def _minimise(problem: Problem, physics: Physics) -> list[Vec]:
         slope = reduce(sp.plus, map(sp.dot, problem.gauss(x), d))
         bend = mass * sp.dot(d[0], d[0]) + sp.dot(d[1], sp.to_world(problem.spin, d[1]))
         for e in d[2:]:
-            bend = bend + sp.dot(base.inertia, sp.each(sp.mul, e, e))
+            bend = bend + sp.dot(base.inertia, sp.map_entries(sp.mul, e, e))
             if base.tyres is not None:
                 bend = bend + base.tyres.mass * sp.dot(base.tyres.sideways, e) ** 2
         lines = [(c, _at(c, x), _rows(c, d)) for c in problem.contacts]
@@ -315,8 +318,8 @@ def wrench_on_base(
     """
     force, _ = contact_force(contact, _at(contact, x), physics)
     wrenches = sp.wrench(arm, sp.combine(force, (contact.n, contact.t, contact.s)))
-    wrench = sp.turned_back(turn, sp.each(sp.total, wrenches))
-    return sp.each(lambda x: -x, wrench)  # the contacts' force is on the object
+    wrench = sp.turned_back(turn, sp.map_entries(sp.total, wrenches))
+    return sp.map_entries(lambda x: -x, wrench)  # the contacts' force is on the object
 
 
 def _any(active: Array) -> Array:
