@@ -30,7 +30,9 @@ import xarray as xr
 Record: TypeAlias = dict[str, Any]  # processor, versions, variables: digest, mean, size of each
 
 FILE = Path(__file__).with_name("publish") / "probes.json"
-TOLERANCE = 0.05  # of the root mean square of a variable, on another processor
+# Of the root mean square of a variable, on another processor: pushes are chaotic, and one of 24
+# worlds that ends otherwise changes a mean by a twentieth.
+TOLERANCE = 0.2
 _ROUNDING = 1e-6  # root mean square below which a variable is rounding, in any unit
 _SWEEPS = Path(__file__).parent
 _PACKAGES = ("jax", "mujoco", "numpy")

@@ -111,9 +111,9 @@ RECORD = {"processor": "a core", "versions": {"jax": "1"}, "variables": {"x": ["
         ({}, True),
         ({"variables": {"renamed": ["ab", 1.0, 2.0], "more": ["cd", 0.0, 0.0]}}, True),
         ({"variables": {"x": ["cd", 1.0, 2.0]}}, False),
-        ({"processor": "other", "variables": {"x": ["cd", 1.09, 2.09]}}, True),
-        ({"processor": "other", "variables": {"x": ["cd", 1.11, 2.0]}}, False),
-        ({"versions": {"jax": "2"}, "variables": {"x": ["cd", 1.0, 2.11]}}, False),
+        ({"processor": "other", "variables": {"x": ["cd", 1.3, 2.3]}}, True),
+        ({"processor": "other", "variables": {"x": ["cd", 1.5, 2.0]}}, False),
+        ({"versions": {"jax": "2"}, "variables": {"x": ["cd", 1.0, 2.5]}}, False),
         ({"processor": "other", "variables": {}}, False),
     ],
 )
