@@ -7,8 +7,9 @@ import sys
 import time
 
 import pytest
-from helpers import one_sentence, refusal, refusing, rps
+from helpers import one_sentence, refusal, refusals, refusing, rps
 
+import rps_jax
 from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
@@ -390,3 +391,11 @@ def test_a_pointer_of_git_lfs_is_named(command, tmp_path, monkeypatch, capsys):
     sentence = refusal(capsys, *words)
     assert name in sentence
     assert sentence.endswith("fetch the file itself by `git lfs pull`.\n")
+
+
+test_an_argument_of_no_name_is_refused_with_its_place = refusals(
+    rps_jax.sweep,
+    ({"engine": "mjx"}, r"engine of sweep belongs to its setting: write setting=Setting\(engine="),
+    ({"horizon": 3.0}, r"write setting=Setting\(rules=Rules\(horizon=\.\.\.\)\)"),
+    ({"wolrds": 3}, "unknown argument of sweep 'wolrds': .*did you mean 'worlds'"),
+)

@@ -20,11 +20,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import inspect
 import itertools
 import re
 import shlex
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
@@ -57,6 +58,7 @@ from rps_jax.runs.run import Run
 from rps_jax.trials.case import suited_laws
 from rps_jax.trials.progress import Bar, ProgressCallback, is_interactive
 from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import (
     Domain,
@@ -94,11 +96,23 @@ def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
     @functools.wraps(command, assigned=("__module__", "__doc__"), updated=())
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         current: Any = current_names(command, kwargs)
+        for name in current:
+            _check_argument(name, inspect.signature(command).parameters, call.__name__)
         return command(*args, **current)()  # pyright: ignore[reportCallIssue]
 
     call.__name__ = call.__qualname__ = snake_case(command.__name__)
     call.__doc__ = f"{command.__doc__}\n\nFields of `{command.__name__}` are its arguments.\n"
     return call
+
+
+def _check_argument(name: str, known: Collection[str], function: str) -> None:
+    """Raise InputError for an unknown argument of a command's function, with what to write."""
+    places = {x.name: f"Setting({x.name}=...)" for x in fields(Setting)}
+    places |= {x: f"Setting(rules=Rules({x}=...))" for x in Rules._fields}
+    if name in places and name not in known and "setting" in known:
+        text = f"{name} of {function} belongs to its setting: write setting={places[name]}."
+        raise errors.InputError(text)
+    errors.check_name(f"argument of {function}", name, known)
 
 
 def current_names(command: object, values: Mapping[str, T]) -> dict[str, T]:
