@@ -203,8 +203,9 @@ class Command(Generic[T]):
         Raises:
           InputError: an option is not allowed.
         """
-        options.check_fields(self)
         device.check_process()
+        device.check_eager(self.name, vars(self))
+        options.check_fields(self)
         with device.standard_jax():
             command = self.with_quick_values()
             command.validate()
