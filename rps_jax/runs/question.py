@@ -22,7 +22,6 @@ import dataclasses
 import functools
 import itertools
 import re
-import shlex
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -463,12 +462,12 @@ class SimulationQuestion(TrialQuestion[T]):
         """Return a command of the shell with values, and with robot, task and physics of this."""
         same = {name: getattr(self, name, None) for name in ("robot", "task")}
         options_ = same | {"physics": vars(self.setting)["physics"]} | values
-        words = ["rps", *command.split()]
+        words = command.split()
         for name, value in options_.items():
             several = value if isinstance(value, tuple | list) else (value,)
             if all(isinstance(x, str) for x in several) and value != "default":
                 words += [f"--{name}", *map(str, several)]
-        return shlex.join(words)
+        return provenance.shell(*words)
 
 
 @dataclass(frozen=True)
