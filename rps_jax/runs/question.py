@@ -466,7 +466,7 @@ class SimulationQuestion(TrialQuestion[T]):
         for name, value in options_.items():
             several = value if isinstance(value, tuple | list) else (value,)
             if all(isinstance(x, str) for x in several) and value != "default":
-                words += [f"--{name}", *map(str, several)]
+                words += [f"--{name}", *several]
         return provenance.shell(*words)
 
 
