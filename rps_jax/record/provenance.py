@@ -53,9 +53,8 @@ def _command() -> list[str]:
 def shell(*words: object) -> str:
     """Return a command of the shell, after the files that ran before the present one."""
     program, *rest = _command()
-    files = [*itertools.takewhile(lambda word: word.endswith(".py"), rest)]
-    option = next(iter(rest[len(files) :]), "-").startswith("-")  # of a question in a file
-    return shlex.join(["rps", *([] if program != "rps" or option else files), *map(str, words)])
+    files = itertools.takewhile(lambda word: word.endswith(".py"), rest)
+    return shlex.join(["rps", *(files if program == "rps" else ()), *map(str, words)])
 
 
 def write_environment(folder: Path, environment: JsonObject) -> None:

@@ -191,7 +191,7 @@ class Command(Generic[T]):
 
         defaults = values(type(self), Setting())
         for name, value in values(self, self._setting or Setting()).items():
-            if value is not defaults[name] and value != defaults[name]:
+            if value != defaults[name]:
                 raise errors.not_allowed(name, value, "the run has its own; omit it")
 
     # --- for callers -----------------------------------------------------------------------
