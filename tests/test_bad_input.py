@@ -67,7 +67,7 @@ CORRUPT = {
     "laws": ({"laws": []}, ""),
     "physics": ({"physics": {"timestep": -1}}, "timestep = -1 is not allowed"),
 }
-VERSIONS = {"older": {"rules": {"horizon": 300.0}}}
+VERSIONS = {"older": {"rules": {"horizon": 300.0}}, "foreign": {"engine": "mine"}}
 # The same of several commands: "COMMAND, COMMAND: arguments".
 SHARED = {
     "table, hardware, paper, sweep, ladder, tune es: --out file": "out = file cannot be written",
@@ -181,6 +181,7 @@ COMMANDS = {
         "run in_c --out x": "run = in_c has another plan than run .engine = 'mjx' there",
     },
     "replay": {
+        "foreign 0": "run = foreign has an unknown engine 'mine': give the file that registers",
         "older 0": "older was written by another version .rules.max_lost = None there, 150",
         "run x": "world = x is not allowed: give a whole number",
         "run -1": "world = -1 is not allowed: it must be a whole number from 0 to",

@@ -336,6 +336,10 @@ def test_functions_that_return_numbers_of_the_host_cannot_be_transformed(transfo
         transform(lambda law: rps_jax.value_and_grad(final_distance, law).value.values)
     with refusing(f"evaluate returns .*{words}"):
         transform(lambda law: rps_jax.evaluate(law).score.values)
+    with refusing(f"push returns .*{words}"):
+        transform(lambda law: rps_jax.push(law=law).outcome.time)
+    with refusing(f"sweep returns .*{words}"):
+        transform(lambda law: rps_jax.sweep({"mine": law}).time.values)
     assert not compiled
 
 

@@ -199,6 +199,8 @@ def test_quasistatic_slides_on_drawn_feet():
 def test_feet_are_drawn_only_for_random_objects():
     with refusing("only random objects have drawn feet"):
         domains.parse_domain("wide,objects=box,feet=0.5:0.9")
+    with refusing("the feet of on_feet leave no support to draw"):
+        domains.parse_domain("wide,objects=on_feet,support=0:2")
     ranges, plain = (domains.parse_domain(f"wide{feet}") for feet in (",feet=0.5:0.9", ""))
     names = {"feet", "feet_number", "feet_turn"}
     assert set(points.names(ranges)) - set(points.names(plain)) == names

@@ -12,7 +12,7 @@ from helpers import refusing, rps, setting_of, slow
 from numpy.testing import assert_array_equal
 
 import rps_jax
-from rps_jax.control import registry
+from rps_jax.control import registry, validation
 from rps_jax.control.base import Law
 from rps_jax.control.observation import Details, Twist
 from rps_jax.control.registry import register_law
@@ -132,3 +132,11 @@ def test_laws_that_ran_keep_their_results_when_another_fails(registries, tmp_pat
     assert results.law.values.tolist() == ["rps"]
     expected = rps_jax.sweep("rps", domain, worlds=3, setting=setting)
     assert_array_equal(results.base_pose, expected.base_pose)
+
+
+def test_a_learned_law_is_checked_on_the_robot_of_the_paper(monkeypatch):
+    monkeypatch.setattr(validation, "_TAXELS", 51)
+    law = registry.law_of(params := registry.LAWS["learned_small"])
+    validation.check_law(law, params)  # of no robot
+    with refusing("the law was learned with 42"):
+        validation.check_law(law, params, 51)

@@ -490,6 +490,12 @@ def test_a_trial_without_a_touch_leaves_no_nan_in_the_table():
     assert rows[1][-2:] == ["20 mm / 20 mm", "0.0300 rad / 0.0300 rad"]
 
 
+def test_a_push_without_a_touch_has_no_error_of_the_face():
+    setting = Setting("quasistatic", rules=Rules(horizon=0.1))
+    summary = rps_jax.push(task="pose", gap=0.5, setting=setting).summary
+    assert summary.endswith("never touched")
+
+
 def test_a_planner_solves_what_the_law_or_one_of_its_tries_solves():
     """Sight is no part of it."""
     laws = ["touch", "sight", "try 0", "try 1"]

@@ -79,6 +79,11 @@ DAMAGE = {
 }
 
 
+def test_a_printed_command_has_the_files_that_ran_before(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["rps", "a.py", "b.py", "sweep", "--laws", "c.py"])
+    assert provenance.shell("replay", "my run", 3) == "rps a.py b.py replay 'my run' 3"
+
+
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
     """A run folder with everything in it."""

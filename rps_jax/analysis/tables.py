@@ -1,6 +1,5 @@
 """Tables of results: a header and rows of text cells, and their Markdown."""
 
-import shlex
 from collections.abc import Sequence
 from itertools import combinations
 
@@ -10,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax.analysis import statistics
 from rps_jax.analysis.statistics import Comparison
+from rps_jax.record import provenance
 from rps_jax.world import paper, tasks
 
 
@@ -270,7 +270,7 @@ def worlds_table(results: xr.Dataset, run: str, worlds: np.ndarray) -> list[list
                 f"{float(trials.mass):.1f} kg",
                 f"{float(trials.friction_ground):.2f}, {float(trials.friction_robot):.2f}",
                 f"{float(trials.distance):.1f} m at {np.degrees(float(trials.bearing)):.0f} deg",
-                f"`rps replay {shlex.quote(run)} {world} --law {shlex.quote(fails)}`",
+                f"`{provenance.shell('replay', run, world, '--law', fails)}`",
             ]
         )
     return rows

@@ -121,29 +121,6 @@ def laws_for(drive: DriveKind) -> list[str]:
     return [name for name, law in laws.items() if drive in law.drives and not law.heading]
 
 
-def check_task(
-    params: LawParams, task: str, room: float, wider: Sequence[str], follows: bool
-) -> None:
-    """Raise InputError unless a law suits a task.
-
-    This leaves it `room` [m] around the object, more with greater values of its options `wider`,
-    and its target moves if the law `follows` it.
-    """
-    law, rule = law_of(params), ""
-    if follows and law.heading and not law.follows:
-        rule = (
-            "its target moves along a path, which the law does not follow; choose path_pose, and "
-        )
-        rule += "heading=... for the path's end"
-    elif law.room > room:
-        rule = f"its detours need {law.room:g} m without walls around the object, not {room:g} m; "
-        rule += "choose another law"
-        if wider:
-            rule += f", or give the task a greater {' or '.join(wider)}"
-    if rule:
-        raise errors.not_allowed("task", f"{task} with the law {_name_of(params)}", rule)
-
-
 def check_drive(params: LawParams, drive: DriveKind) -> None:
     """Raise InputError unless a base with this drive can follow the law's twists."""
     if drive in law_of(params).drives:
@@ -152,7 +129,7 @@ def check_drive(params: LawParams, drive: DriveKind) -> None:
     rule = f"it moves sideways, which a base with drive = {drive} cannot; choose {known}"
     if not type(params).__module__.startswith("rps_jax."):
         rule += f', or declare Law(..., drives=("{drive}",)) of this one if it does not'
-    raise errors.not_allowed("law", _name_of(params), rule)
+    raise errors.not_allowed("law", name_of(params), rule)
 
 
 def preset_of(params: object) -> LawParams | None:
@@ -160,7 +137,7 @@ def preset_of(params: object) -> LawParams | None:
     return next((x for x in LAWS.values() if type(x) is type(params)), None)
 
 
-def _name_of(params: LawParams) -> str:
+def name_of(params: LawParams) -> str:
     """Return the name of a law with these parameters, or of the first with parameters like them."""
     leaves, kind = jax.tree.leaves(params), type(params)
     names = {name: jax.tree.leaves(x) for name, x in LAWS.items() if type(x) is kind}

@@ -66,7 +66,7 @@ def check_eager(name: str, inputs: object) -> None:
     """Raise InputError for traced inputs of a function, or within `jax.jit`."""
     import jax
 
-    leaves = jax.tree.leaves((inputs, jax.numpy.zeros(())))
+    leaves = jax.tree.leaves((inputs, jax.device_put(0.0)))
     if any(isinstance(x, jax.core.Tracer) for x in leaves):
         raise InputError(
             f"{name} returns numbers of the host: call it outside of jit, vmap and grad, or "

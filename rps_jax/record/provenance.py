@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import itertools
 import platform
 import shlex
 import subprocess
@@ -47,6 +48,13 @@ def _command() -> list[str]:
     if program.name in ("rps", "rps.exe") or program.parts[-2:] == ("rps_jax", "__main__.py"):
         return ["rps", *sys.argv[1:]]
     return ["python", sys.argv[0], *sys.argv[1:]] if program.suffix == ".py" else list(sys.argv)
+
+
+def shell(*words: object) -> str:
+    """Return a command of the shell, after the files that ran before the present one."""
+    program, *rest = _command()
+    files = itertools.takewhile(lambda word: word.endswith(".py"), rest)
+    return shlex.join(["rps", *(files if program == "rps" else ()), *map(str, words)])
 
 
 def write_environment(folder: Path, environment: JsonObject) -> None:

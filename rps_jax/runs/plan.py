@@ -181,6 +181,10 @@ def load_plan(folder: Path) -> Plan:
     try:
         plan = Plan(**manifest.fields_from_json(Plan, record, folder))
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+        text = str(error.__cause__ or error)
+        if name := re.match("unknown (engine|domain (quantity|object)|task) '[^']*'", text):
+            rule = "give the file that registers it before the command, as rps FILE.py replay RUN"
+            raise InputError(f"run = {folder} has an {name[0]}: {rule}.") from error
         raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
     if "points" in record:
         plan = dataclasses.replace(plan, points=Points.read(folder, str(record["points"])))

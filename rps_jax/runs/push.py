@@ -97,8 +97,8 @@ class Trace(Trajectory):
             parts = ["never touched"]
         elif "progress" in outcome.task:
             parts.append(f"{100 * float(outcome.task['progress']):.0f} % of the path passed")
-        if "place_error" in outcome.task:
-            place, turn = (float(outcome.task[f"{x}_error"]) for x in ("place", "heading"))
+        place, turn = (outcome.task.get(f"{x}_error", np.nan) for x in ("place", "heading"))
+        if np.isfinite(place):
             parts.append(f"face off by {place:.3f} m and {turn:.3f} rad")
         parts += tasks.failures_of(outcome.task)
         return (

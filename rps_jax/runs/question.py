@@ -23,7 +23,6 @@ import functools
 import inspect
 import itertools
 import re
-import shlex
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -206,7 +205,7 @@ class Command(Generic[T]):
 
         defaults = values(type(self), Setting())
         for name, value in values(self, self._setting or Setting()).items():
-            if value is not defaults[name] and value != defaults[name]:
+            if value != defaults[name]:
                 raise errors.not_allowed(name, value, "the run has its own; omit it")
 
     # --- for callers -----------------------------------------------------------------------
@@ -217,8 +216,9 @@ class Command(Generic[T]):
         Raises:
           InputError: an option is not allowed.
         """
-        options.check_fields(self)
         device.check_process()
+        device.check_eager(self.name, vars(self))
+        options.check_fields(self)
         with device.standard_jax():
             command = self.with_quick_values()
             command.validate()
@@ -476,12 +476,12 @@ class SimulationQuestion(TrialQuestion[T]):
         """Return a command of the shell with values, and with robot, task and physics of this."""
         same = {name: getattr(self, name, None) for name in ("robot", "task")}
         options_ = same | {"physics": vars(self.setting)["physics"]} | values
-        words = ["rps", *command.split()]
+        words = command.split()
         for name, value in options_.items():
             several = value if isinstance(value, tuple | list) else (value,)
             if all(isinstance(x, str) for x in several) and value != "default":
-                words += [f"--{name}", *map(str, several)]
-        return shlex.join(words)
+                words += [f"--{name}", *several]
+        return provenance.shell(*words)
 
 
 @dataclass(frozen=True)

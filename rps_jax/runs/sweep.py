@@ -4,7 +4,6 @@ The design is paired: every law meets the same worlds. `execution` runs the plan
 """
 
 import functools
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -210,7 +209,7 @@ class Sweep(SweepOptions, PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQues
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         if "row" in results.dims:
-            text = f"When all shards are done: `rps merge {shlex.quote(str(self.out))} --out ...`, "
+            text = f"When all shards are done: `{provenance.shell('merge', self.out)} --out ...`, "
             return [Section(f"Shard {self.shard}", text + "with the run folder of each shard.")]
         sections = list(super().report(results, run))
         if "model_success" in results:

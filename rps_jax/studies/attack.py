@@ -8,7 +8,6 @@ misses and failures, and failures alone as soon as there are enough. Emitters va
 quantiles of ranges and choices. Noise and corners of prisms are random in every world.
 """
 
-import shlex
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +34,7 @@ from rps_jax.analysis.figures.style import (
 )
 from rps_jax.engines import device
 from rps_jax.questions import LawQuestion, Picture, Plan, Run, Section, call_of, option
-from rps_jax.record import files
+from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.files import Arrays
 from rps_jax.runs import execution
@@ -191,10 +190,10 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         if run.folder is not None and results.sizes["elite"]:
             folder = str(run.folder / "worlds")
             worst = load(folder)
+            film = provenance.shell("film", folder, "--which", "hardest", "--grid", "3x4")
             text = (
                 f"{count_true(worst.success.values == 0)} of {worst.sizes['world']} fail again in "
-                f"the same engine. `rps film {shlex.quote(folder)} --which hardest --grid 3x4` "
-                "films the worst."
+                f"the same engine. `{film}` films the worst."
             )
             rows = tables.worlds_table(worst, folder, statistics.hardest(worst, self.worst))
             sections.append(Section("The worst", text, rows))

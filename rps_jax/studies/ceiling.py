@@ -235,7 +235,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         sampled = np.flatnonzero(worlds == np.arange(worlds.size))  # consecutive from 0 on
         solved, alone = (count_true(results[x].values[sampled] > 0) for x in ("solved", "alone"))
         text = (
-            f"MPPI around the tuned law, which knows each world, solves {solved} of the first "
+            f"MPPI around a tuned law, which knows each world, solves {solved} of the first "
             f"{sampled.size} worlds ({tables.share(solved, sampled.size)}); the law without a plan "
             f"solves {alone} of them. This share is a lower bound: a world that the planner does "
             "not solve may still be solvable."

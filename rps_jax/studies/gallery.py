@@ -1,6 +1,5 @@
 """Gallery of failures: maps of failed trials by failure mode, and what each mode has in common."""
 
-import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.paper import draw_path
 from rps_jax.analysis.figures.style import WIDTH, Figure, styled, tiles
 from rps_jax.questions import Picture, Plan, Run, Section, call_of, option
-from rps_jax.record import files
+from rps_jax.record import files, provenance
 from rps_jax.runs.plan import build_batch
 from rps_jax.runs.push import find_differences, program_slots, select_law
 from rps_jax.runs.question import Question, Rows
@@ -114,8 +113,8 @@ class Gallery(Question[xr.Dataset]):
         for mode, indices in worlds.items():
             plotted = {i: traces[i] for i in indices[: self.each].tolist()}
             title = f"{law}: {mode}, {len(plotted)} of {indices.size} in {size} worlds"
-            run_text, law_text = shlex.quote(str(self.run)), shlex.quote(law)
-            text = f"Example: `rps replay {run_text} {indices[0]} --law {law_text}`."
+            command = provenance.shell("replay", self.run, indices[0], "--law", law)
+            text = f"Example: `{command}`."
             picture = Picture(mode.replace(" ", "_"), partial(maps_figure, plotted, title))
             rows = trials_table(plotted)
             sections.append(Section(f"{mode}: {indices.size} of {size}", text, rows, picture))

@@ -79,8 +79,7 @@ class Case(TrialOptions):
         name = objects.parse_object(self.object)
         objects.check_object("object", name)
         registry.check_params(self.params)
-        task, follows = self.challenge, not self.challenge.HAS_TARGET
-        registry.check_task(self.params, task.kind, task.free_room, task.ROOM_OPTIONS, follows)
+        self.challenge.check_law(self.params)
         scene.check_contact(self.contact, self.mass)
         skins.parse_skin(self.skin or "ideal")
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")

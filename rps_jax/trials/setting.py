@@ -133,8 +133,7 @@ class Setting:
         self.simulator.check_pads(domain.has_pads, self.physics)
         self.check_here(domain.weakest, laws)
         for params in laws:
-            task, follows = domain.task, not domain.task.HAS_TARGET
-            registry.check_task(params, task.kind, task.free_room, task.ROOM_OPTIONS, follows)
+            domain.task.check_law(params)
 
     def to_json(self) -> JsonObject:
         """Return the setting as manifests have it; `from_json` reads it."""

@@ -25,6 +25,7 @@ from rps_jax.world.objects import (
     PAPER_OBJECTS,
     check_object,
     custom_solids,
+    has_feet,
     is_on_pads,
     parse_object,
     text_of,
@@ -317,6 +318,8 @@ class Domain:
         if not set(self.objects) & set(RANDOM):
             cause = f"its objects {', '.join(self.objects)} leave"
             unused |= dict.fromkeys(sorted(OBJECT_QUANTITIES), cause)
+        if all(map(has_feet, self.objects)):
+            unused["support"] = f"the feet of {', '.join(self.objects)} leave"
         if self.frictions:
             unused |= dict.fromkeys(("friction_ground", "friction_robot"), "its frictions leave")
         has_targets = len(self.targets) > 0

@@ -143,6 +143,11 @@ def check_object(kind: str, name: str, *more: str) -> str:
     return errors.check_name(kind, name, known, "FILE.xml")
 
 
+def has_feet(name: str) -> bool:
+    """Return whether a custom object stands on feet of its own."""
+    return name in REGISTERED and REGISTERED[name].solid.feet is not None
+
+
 def is_on_pads(name: str) -> bool:
     """Return whether a custom object stands on pads, or on feet with weights."""
     return name in REGISTERED and REGISTERED[name].solid.pads is not None

@@ -14,6 +14,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from rps_jax import errors
+from rps_jax.control import registry
+from rps_jax.control.base import LawParams
 from rps_jax.geometry.arrays import Array, Bool, Entries, Float, Pytree, Scalar, Vector
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays, JsonObject
@@ -135,6 +137,21 @@ class Task:
     def has_contact_walls(self) -> bool:
         """Whether the object touches walls by contact forces."""
         return False
+
+    def check_law(self, params: LawParams) -> None:
+        """Raise InputError unless a law suits the room around the object, and a moving target."""
+        law, rule = registry.law_of(params), ""
+        if not self.HAS_TARGET and law.heading and not law.follows:
+            rule = "its target moves along a path, which the law does not follow; "
+            rule += "choose path_pose, and heading=... for the path's end"
+        elif law.room > self.free_room:
+            rule = f"its detours need {law.room:g} m without walls around the object, "
+            rule += f"not {self.free_room:g} m; choose another law"
+            if wider := " or ".join(self.ROOM_OPTIONS):
+                rule += f", or give the task a greater {wider}"
+        if rule:
+            name = f"{self.kind} with the law {registry.name_of(params)}"
+            raise errors.not_allowed("task", name, rule)
 
     @property
     def free_room(self) -> float:
