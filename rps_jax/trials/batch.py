@@ -552,9 +552,12 @@ def _run(
                         slots.trials = moved
                     unread.append((start_time, [*map(np.count_nonzero, live)], states))
                 case Report(at, indices):
-                    ended = map(_ended, at, indices, results, [program.period] * len(data))
+                    ended = [  # trials, their outcomes, and the time [s] that all advanced
+                        (trials, rows(x.outcome, slots), float(x.steps.sum()) * program.period)
+                        for trials, slots, x in zip(indices, at, results, strict=True)
+                    ]
                     report.result()
-                    report = reporter.submit(partial(monitor.add, *list(ended), segment=segment))
+                    report = reporter.submit(partial(monitor.add, *ended, segment=segment))
                 case Fill(free):
                     filled = [x.fill(slots) for x, slots in zip(data, free, strict=True)]
                     state, following = segments.step(state, Filled(filled, monitor.stops(program)))
@@ -579,11 +582,6 @@ def _load(program: _Program, device: Device, monitor: _Monitor) -> _Advance:
     steps = np.int32(max(1, round(SEGMENT / program.period)))
     monitor.add_compile_time((program, device), monitor.elapsed - start_time)
     return lambda *arguments: advance(stages, *arguments, rules, steps)
-
-
-def _ended(at: np.ndarray, indices: np.ndarray, state: SegmentState, period: float) -> _Ended:
-    """Return the trials in the slots `at`, and the time [s] that all trials advanced."""
-    return indices, rows(state.outcome, at), float(state.steps.sum()) * period
 
 
 # --- trials on demand ----------------------------------------------------------------------

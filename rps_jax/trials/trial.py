@@ -234,8 +234,9 @@ def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
         twists=jnp.zeros((*world.odometry.past.shape, 3), world.qpos.dtype),
         min_distance=jnp.full_like(zero, jnp.inf),
         **dict.fromkeys(("sum_abs_l", "path_length", "lost_path", "tilt"), zero),
-        **dict.fromkeys(("steps", "contact_steps", "lost_steps"), count),
-        **dict.fromkeys(("absent_steps", "repositions"), count),
+        **dict.fromkeys(
+            ("steps", "contact_steps", "lost_steps", "absent_steps", "repositions"), count
+        ),
         **dict.fromkeys(("done", "success", "tipped", "diverged", "nan_twist"), false),
         drive=None if world.robot is None else base.init_drive(world.qpos),
         load=base.init_load(world.qpos) if law.senses == "force" else None,
@@ -326,8 +327,9 @@ def observe(
     declared = None if is_done is None else jnp.asarray(is_done(trial.law_state))
     positions = positions_of(world, trial.qpos, reading.p_robot_contact, touch, declared)
     task, aim = world.task.step(trial.task, positions)
-    aims = {"p_world_target": aim.p_world_target, "yaw_target": aim.yaw_target}
-    observation = observation._replace(**aims, relative=aim.relative)
+    observation = observation._replace(
+        p_world_target=aim.p_world_target, yaw_target=aim.yaw_target, relative=aim.relative
+    )
     success = aim.success
     if success is None:
         success = touch & (distance < params.d_success) & aim.at_end

@@ -24,7 +24,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.arrays import Entries, Pytree
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
-from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
+from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, Shift, World
@@ -150,11 +150,14 @@ def drawn_worlds(
     if remembered is None:
         remembered = remembered_steps(domain, setting.physics.control_period)
     odometry = _drawn(drawn, "base") | {"velocity_error": drawn.velocity_error}
+    sensor = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
+    repeated: Pytree = jax.tree.map(lambda x: np.full(drawn.indices.size, x, float), sensor)
+    quantities = {} if domain.skin == "ideal" else _drawn(drawn, "skin")
     return build(
         drawn.indices,
         drawn.inputs(domain, setting.physics),
         setting,
-        skin=_skin(domain, drawn),
+        skin=repeated._replace(shell=drawn.robot.shell, **quantities),
         p_world_target=drawn.p_world_target,
         task=drawn.course,
         shift=Shift(np.full(count, np.inf), np.zeros((count, 2))),
@@ -167,13 +170,6 @@ def drawn_worlds(
 def _drawn(drawn: Draw, owner: Owner) -> dict[str, Entries]:
     """Return the drawn quantities of an owner by name."""
     return {name: drawn.values[name] for name in quantities_of(owner) if name in drawn.values}
-
-
-def _skin(domain: Domain, drawn: Draw) -> Skin:
-    sensor = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
-    repeated: Pytree = jax.tree.map(lambda x: np.full(drawn.indices.size, x, float), sensor)
-    quantities = {} if domain.skin == "ideal" else _drawn(drawn, "skin")
-    return repeated._replace(shell=drawn.robot.shell, **quantities)
 
 
 def soften_skins(worlds: World) -> World:

@@ -95,7 +95,7 @@ def random_steps(
     return (
         directions,
         (thetas + offsets).reshape(-1, thetas.shape[-1]),
-        repeat(worlds, 2 * options.pairs),
+        jax.tree.map(lambda x: jnp.concatenate([x] * (2 * options.pairs)), worlds),
     )
 
 
@@ -111,8 +111,3 @@ def per_world(theta: Array, worlds: PyTree) -> Array:
     """Return theta, (p,) or (n, p), for each world, (n, p)."""
     count = jax.tree.leaves(worlds)[0].shape[0]
     return jnp.broadcast_to(theta, (count, theta.shape[-1]))
-
-
-def repeat(worlds: PyTree, times: int) -> PyTree:
-    """Repeat worlds (n, ...) several times, (times n, ...)."""
-    return jax.tree.map(lambda x: jnp.concatenate([x] * times), worlds)

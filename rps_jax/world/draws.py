@@ -17,7 +17,6 @@ from rps_jax.geometry.solid import GRAVITY, SIDES, Solid
 from rps_jax.record.files import Arrays
 from rps_jax.robot.robot import Robot
 from rps_jax.world import objects, scene
-from rps_jax.world import quantity as quantities
 from rps_jax.world.domain import (
     QUANTITIES,
     RANDOM,
@@ -29,6 +28,7 @@ from rps_jax.world.domain import (
     unit_of,
 )
 from rps_jax.world.physics import Physics
+from rps_jax.world.quantity import COLUMNS, random_numbers, stream
 from rps_jax.world.scene import Friction, Surroundings, WorldInputs
 from rps_jax.world.tasks.base import Course, CourseInputs
 
@@ -64,7 +64,8 @@ def draw(
 
 def numbers(seed: int, index: np.ndarray) -> Arrays:
     """Return the random numbers (n,) in [0, 1) of the worlds `index` (n,), by name."""
-    return quantities.numbers(seed, index, number_names())
+    names, table = number_names(), random_numbers(seed, index)
+    return {x: table[:, COLUMNS[x]] if x in COLUMNS else stream(seed, x, index) for x in names}
 
 
 def draw_at(

@@ -19,7 +19,6 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.record.files import Arrays
 from rps_jax.spec import Spec, specs_of
 
 
@@ -202,9 +201,3 @@ def _rows(key: int, index: np.ndarray, count: int) -> np.ndarray:
         block = np.random.Generator(bits).random((last - first + 1, count))
         rows[near] = block[index[near] - first]
     return rows
-
-
-def numbers(seed: int, index: np.ndarray, names: tuple[str, ...]) -> Arrays:
-    """Return the numbers (n,) in [0, 1) of some names in the worlds `index` (n,)."""
-    table = random_numbers(seed, index)
-    return {x: table[:, COLUMNS[x]] if x in COLUMNS else stream(seed, x, index) for x in names}

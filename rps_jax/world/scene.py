@@ -152,7 +152,12 @@ def load(
         upright = compile_solid(FAMILIES[name], single, physics, friction, robot=robot)
         _set_robot(spec, robot)
         if drawn is not None:
-            _resize(spec, drawn)
+            # Stretch the geoms, of which `object` is a box, to the drawn box.
+            body, half = spec.body("object"), np.append(drawn.vertices[0], drawn.height / 2)
+            ratio = half / spec.geom("object").size
+            body.pos[2] = half[2]
+            for geom in body.geoms:
+                geom.pos, geom.size = geom.pos * ratio, geom.size * ratio
         return upright._replace(name=name, model=spec.compile())
     for geom in spec.geoms:
         if geom.name == "load" and rear == "far":
@@ -225,23 +230,6 @@ def base_size(robots: Robot, count: int) -> np.ndarray:
     """Return half length and half width (count, 2) [m] of bases, or their radius (count, 1)."""
     sizes = np.stack(robots.sizes, axis=-1)
     return np.broadcast_to(np.asarray(sizes, float), (count, sizes.shape[-1]))
-
-
-def base_invweight(robots: Robot) -> np.ndarray:
-    """Return MuJoCo's inverse weight [1/kg] in a contact of bases with a limited force.
-
-    It is the mean over x, y and z of the acceleration by a force of 1 N; along z the base is fixed.
-    """
-    return 2 / (3 * np.asarray(robots.mass, float))
-
-
-def _resize(spec: mujoco.MjSpec, box: Solid) -> None:
-    """Stretch the geoms of an object, of which the geom `object` is a box, to another box."""
-    body, half = spec.body("object"), np.append(box.vertices[0], box.height / 2)
-    ratio = half / spec.geom("object").size
-    body.pos[2] = half[2]
-    for geom in body.geoms:
-        geom.pos, geom.size = geom.pos * ratio, geom.size * ratio
 
 
 def geom_sizes(family: str, solids: Solid) -> Arrays:
