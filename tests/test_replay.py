@@ -57,11 +57,6 @@ CASES = {
         "fused",
         1.0,
     ),
-    "a law that senses force, on a robot with limits in a corridor": (
-        "force_push_published",
-        "real,objects=random_cylinder",
-        "corridor,width=2:2.2,length=8:10",
-    ),
     "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
 }
 HALL = {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]], "start": [1.5, 3, 0], "goal": [7, 3]}
@@ -70,6 +65,11 @@ TASKS = {
     "rooms": HALL,
 }  # with places for the widest object
 SLOW_CASES = {
+    "a law that senses force, on a robot with limits in a corridor": (
+        "force_push_published",
+        "real,objects=random_cylinder",
+        TASKS["corridor"],
+    ),
     "MJX": ("rps", "wide,objects=random_box", "reach", "mjx", 1.0),
     "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),
     **{
