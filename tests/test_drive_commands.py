@@ -121,6 +121,7 @@ def test_the_ceiling_plans_without_a_sideways_velocity(drive):
     assert results["mean"].sel(axis="omega").values.any()
 
 
+@pytest.mark.slow
 def test_a_law_is_learned_with_actions_of_two_numbers(tmp_path):
     small = {"network": "mlp", "width": 4, "num_envs": 4, "num_steps": 2, "num_minibatches": 1}
     small |= {"drawn": 4, "validation": 2, "minutes": 0, "updates": 1}

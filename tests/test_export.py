@@ -104,7 +104,11 @@ def test_a_fault_in_c_is_detected(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "compiler"), diagonal(("rps_plus", "learned_small", "pose", CUSTOM), COMPILERS)
+    ("name", "compiler"),
+    [
+        *diagonal(("rps_plus", "learned_small"), COMPILERS),
+        *(slow(x, c) for x in ("pose", CUSTOM) for c in COMPILERS),
+    ],
 )
 def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path, registries):
     exported = program.program(name, "kairos")

@@ -118,6 +118,7 @@ def some_points():
     return u
 
 
+@pytest.mark.slow
 def test_objects_may_come_in_any_order(tmp_path):
     u = some_points()
     options = {"setting": replace(SHORT, engine="quasistatic"), "part": 2, "slots": SLOTS}

@@ -281,7 +281,7 @@ def leaves_by_name(trees):
     return [dict(zip(names, row, strict=True)) for row in finite]
 
 
-@pytest.mark.parametrize("corners", [1, 4, 6])
+@pytest.mark.parametrize("corners", [1, slow(4), 6])
 def test_the_support_of_an_object_equals_that_of_the_package(corners):
     """The page recomputes centre of mass and arm when a slider changes their inputs."""
     rng = default_rng(0)

@@ -68,7 +68,11 @@ def slid(family: str, engine: str, physics: Physics) -> Recording:
 
 @pytest.mark.parametrize(
     ("family", "engine"),
-    [x for k in ("box", "cylinder", "prism") for x in ((k, "fused"), slow(k, "mjx"))],
+    [
+        ("box", "fused"),
+        *(slow(k, "fused") for k in ("cylinder", "prism")),
+        *(slow(k, "mjx") for k in ("box", "cylinder", "prism")),
+    ],
 )
 def test_slides_along_walls_agree_with_c_mujoco(family, engine):
     computed, expected = slid(family, engine, STANDARD), slid(family, "mujoco", REFERENCE)
