@@ -396,7 +396,14 @@ def test_a_law_refuses_invalid_parameters_and_restores_valid_ones(name):
 
 # Laws whose successes other tests assert, and variants of other laws here.
 ELSEWHERE = {"pose", "path_pose", "rps_plus", "unicycle", "path_pose_drive", "learned"}
-ELSEWHERE |= {"pose_drive", "path_pose_narrow", "rps_reposition", "unicycle_car", "guided"}
+ELSEWHERE |= {
+    "pose_drive",
+    "path_pose_narrow",
+    "rps_reposition",
+    "unicycle_car",
+    "guided",
+    "dipole",
+}
 
 
 @pytest.mark.parametrize(

@@ -452,7 +452,9 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     assert got.min_distance == pytest.approx(exact.min_distance, abs=2e-3)
 
 
-@pytest.mark.parametrize("law", [rps.LAW, registry.smooth_law(rps.LAW)], ids=["hard", "smooth"])
+@pytest.mark.parametrize(
+    "law", [slow(rps.LAW), registry.smooth_law(rps.LAW)], ids=["hard", "smooth"]
+)
 def test_with_a_warm_skin_a_push_arrives(law):
     """Both laws succeed; the hard law reads the binary contact."""
     ended = push(case((0.7, 0.05), skin=SMOOTH), law, 30.0)
