@@ -208,7 +208,7 @@ def test_a_hand_turns_the_heading_of_a_goal_and_the_object_arrives_there(paused)
     """In contact, in a detour, and after the end; no law brings a car to a pose."""
     prepare = """
     by("base").value = arguments[0]; by("base").dispatchEvent(new Event("change"));
-    by("task").value = "pose"; choose(); play(false); push.setTarget([1.6, 0.3]);
+    by("task").value = "pose"; choose(); play(false); push.setTarget([1.2, 0.3]);
     Object.assign(push.params, { v_free: 0.2, omega_free: 0.5 });
     for (let i = 0; i < arguments[1]; i++) push.step();
     for (let i = 0; i < 40; i++) drawScene(0.1);
@@ -235,7 +235,7 @@ def test_a_hand_turns_the_heading_of_a_goal_and_the_object_arrives_there(paused)
         assert heading == pytest.approx(inputs[1], abs=0.05)
         assert success
         assert outcomes["heading_error"] < 0.1
-        assert np.hypot(*np.subtract(middle, [1.6, 0.3])) < 0.4
+        assert np.hypot(*np.subtract(middle, [1.2, 0.3])) < 0.4
     turn = "push.setGoal({ heading: 0.3, target: [-1.2, 0.3] });"
     assert paused.execute_script(turn + finish)[1]
     used, _ = paused.execute_script(prepare, "car", 0, 0)
