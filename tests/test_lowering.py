@@ -402,7 +402,7 @@ FUSED = {"lax.dot of f f"}
 @pytest.mark.parametrize(
     "name", [COMPILED_AS_USERS_DO, "gpu", slow("c float"), "c double", "js", "onnx"]
 )
-def test_operations_are_those_of_jax(name, tmp_path):
+def test_operations_are_those_of_jax(name, tmp_path_factory):
     if shutil.which(NEEDS.get(name, str(COMPILER))) is None:
         pytest.skip("the compiler of this back end is not installed")
     if name == "onnx":
@@ -415,10 +415,10 @@ def test_operations_are_those_of_jax(name, tmp_path):
                 lower([case])
         else:
             supported.append(case)
-    computed = iter([])
-    for first in range(0, len(supported), 60):  # a compiler takes longer for one long function
-        (folder := tmp_path / str(first)).mkdir()
-        computed = itertools.chain(computed, run(supported[first : first + 60], real, folder))
+    # A compiler takes longer for one long function.
+    parts = [supported[first : first + 60] for first in range(0, len(supported), 60)]
+    folders = map(tmp_path_factory.mktemp, itertools.repeat("part"))
+    computed = iter([x for part in parts for x in run(part, real, next(folders))])
     for case in supported:
         for leaf in expected(real)[case]:
             value = np.asarray(next(computed), float).reshape(leaf.shape)

@@ -91,7 +91,7 @@ def differences(function, x, h=1e-6, steps=1):
     return (up - down).T / (2 * h)
 
 
-@pytest.fixture(scope="module", params=[BALL, slow(BOX)], ids=["ball", "box"])
+@pytest.fixture(scope="module", params=[BALL, slow(BOX)])
 def compiled_body(request):
     """A body on a plane, with programs: step of MJX, our step, its derivatives."""
     with jax.enable_x64(True):

@@ -4,7 +4,6 @@ import itertools
 import json
 import math
 import runpy
-from typing import Any, NamedTuple
 
 import chromium
 import jax
@@ -22,7 +21,7 @@ from rps_jax.lowering.routine import fields_of
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Outcome, Snapshot
+from rps_jax.trials.trial import ControlLoop
 
 MAKE = runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))
 STEPS = 7500  # of a trial
@@ -56,37 +55,23 @@ def browser(tmp_path_factory):
         assert not browser.get_log("browser")
 
 
-class Python(NamedTuple):
-    """A push in Python: trials and snapshots before each step, and the outcome."""
-
-    trials: list[Any]
-    snapshots: Snapshot  # (T, ...)
-    outcome: Outcome
-
-    @property
-    def twists(self):
-        return np.stack(self.snapshots.twist, axis=-1)
-
-
-def python_push(law, target=(-1.0, 0.0), **options):
-    """Return the paper's push, by default to (-1, 0) m, or in a task, in double precision."""
+def python_push(law, **options):
+    """Return snapshots, states after steps and outcome of a push to (-1, 0) m, in float64."""
     setting = Setting("quasistatic")
     with jax.enable_x64(True):
-        worlds = pushes.build([Case("box", "S1", target, law, **options)], setting)
+        worlds = pushes.build([Case("box", "S1", (-1.0, 0.0), law, **options)], setting)
         loop = ControlLoop(setting.physics, setting.rules, worlds.law)
 
         @jax.jit
         def run(inputs):
-            start = trial.start_all(*inputs, np.ones(1, bool), law=loop.law)
-            options = {"loop": loop, "steps": STEPS, "states": True}
-            last, steps = trial.unroll(worlds.stage, *inputs, start, **options)
-            return start, steps, trial.outcome(last, inputs[0], loop)
+            start = trial.start_all(*inputs, law=loop.law)
+            last, steps = trial.unroll(worlds.stage, *inputs, start, loop, STEPS, states=True)
+            return *steps, trial.outcome(last, inputs[0], loop)
 
-        start, (snapshots, trials), outcome = jax.device_get(run(worlds.inputs))
+        snapshots, trials, outcome = jax.device_get(run(worlds.inputs))
     assert trials.done[-1].all()
-    count = 1 + int(np.argmax(trials.done[:, 0]))
-    states = [row(start, 0), *(row(trials, (i, 0)) for i in range(count - 1))]
-    return Python(states, row(snapshots, np.s_[:count, 0]), row(outcome, 0))
+    count = 1 + int(np.argmax(trials.done))
+    return *row((snapshots, trials), np.s_[:count, 0]), row(outcome, 0)
 
 
 BASE_OF = {law: base for base, laws in MAKE["LAWS"].items() for law in laws}
@@ -95,7 +80,8 @@ BASE_OF = {law: base for base, laws in MAKE["LAWS"].items() for law in laws}
 @pytest.mark.slow  # below, a push takes single steps
 @pytest.mark.parametrize("law", ["rps_plus", "rps_tuned", "unicycle", "unicycle_car"])
 def test_a_whole_push_has_the_twists_of_python(law, browser):
-    expected = python_push(law, robot=MAKE["BASES"][BASE_OF[law]][1]).twists
+    snapshots, *_ = python_push(law, robot=MAKE["BASES"][BASE_OF[law]][1])
+    expected = np.stack(snapshots.twist, axis=-1)
     assert expected.dtype == np.float64
     success, computed = browser.execute_script(WHOLE_PUSH, law, "box")
     assert success
@@ -138,12 +124,11 @@ def test_a_task_has_the_outcomes_of_python(kind, width, door, touched, browser):
     task = {"kind": kind, "waypoints": ROUTE, "lookahead": 1.6}
     if kind == "corridor":
         task |= {"width": width, "doors": 1, "door_width": door}
-    in_python = python_push("rps", task=task)
-    expected, steps, last = in_python.outcome, len(in_python.trials), in_python.twists[-1]
+    snapshots, trials, expected = python_push("rps", task=task)
     count, who, outcomes, twist = browser.execute_script(IN_A_TASK, kind, ROUTE, width, door)
     assert (who, bool(expected.success)) == (touched, not touched)
-    assert abs(count - steps) <= 1
-    assert_allclose(twist, last, atol=1e-6)
+    assert abs(count - trials.steps[-1]) <= 1
+    assert_allclose(twist, np.stack(snapshots.twist, axis=-1)[-1], atol=1e-6)
     assert set(outcomes) == set(expected.task)
     for name, value in expected.task.items():
         computed = np.nan if outcomes[name] is None else outcomes[name]
@@ -261,16 +246,17 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
     """
     task = "pose" if law == "pose" else "reach"
     options = {"task": "pose,heading=0.8"} if law == "pose" else {}
-    push = python_push(law, **options)
-    shown = np.arange(0, len(push.trials) - 1, max(1, len(push.trials) // 800))
-    previous = [push.trials[i] for i in shown]
+    snapshots, states, _ = python_push(law, **options)
+    count = len(states.done) - 2
+    shown = np.arange(0, count, max(1, count // 800))
+    previous, expected = [row(states, i) for i in shown], np.stack(snapshots.twist, axis=-1)
     trials = leaves_by_name([step._replace(**MAKE["UNTRACED"]) for step in previous])
     memories = leaves_by_name([step.law_state for step in previous])
     states = list(zip(trials, memories, strict=True))
     # As text: the driver converts each number of an argument by itself.
     computed = np.array(browser.execute_script(SINGLE_STEPS, law, json.dumps(states), task))
-    assert_allclose(computed[:, :3], push.twists[shown], rtol=0, atol=1e-5)
-    assert_allclose(computed[:, 3:], push.snapshots.qpos[shown + 1], rtol=0, atol=1e-7)
+    assert_allclose(computed[:, :3], expected[shown + 1], rtol=0, atol=1e-5)
+    assert_allclose(computed[:, 3:], snapshots.qpos[shown + 2], rtol=0, atol=1e-7)
 
 
 def leaves_by_name(trees):
