@@ -417,8 +417,8 @@ def test_operations_are_those_of_jax(name, tmp_path_factory):
             supported.append(case)
     # A compiler takes longer for one long function.
     parts = [supported[first : first + 60] for first in range(0, len(supported), 60)]
-    folders = map(tmp_path_factory.mktemp, itertools.repeat("part"))
-    computed = iter([x for part in parts for x in run(part, real, next(folders))])
+    folder = tmp_path_factory.mktemp
+    computed = iter([x for part in parts for x in run(part, real, folder("part"))])
     for case in supported:
         for leaf in expected(real)[case]:
             value = np.asarray(next(computed), float).reshape(leaf.shape)

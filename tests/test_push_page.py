@@ -230,8 +230,7 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
     task = "pose" if law.startswith("pose") else "reach"
     options = {"task": "pose,heading=0.8"} if task == "pose" else {}
     snapshots, states, _ = python_push(law, robot=MAKE["BASES"][BASE_OF[law]][1], **options)
-    count = len(states.done) - 2
-    shown = np.arange(0, count, max(1, count // 800))
+    shown = np.arange(0, len(states.done) - 2, 6)
     previous, expected = [row(states, i) for i in shown], np.stack(snapshots.twist, axis=-1)
     trials = leaves_by_name([step._replace(**MAKE["UNTRACED"]) for step in previous])
     memories = leaves_by_name([step.law_state for step in previous])
