@@ -75,12 +75,12 @@ def pytest_configure(config):
 
 # Slow files start first; a slow file at the end would leave processors idle.
 LONGEST = """
-    derivatives push_page pose view library drives learning replay cli drive_commands package_laws
-    finger tune sweep transformations house export mjx_gradients lowering support native robot rooms
-    bags gpu_writer contact_derivatives video rivals random_laws evaluate tasks law_files
-    task_commands failures examples trial ros2 floors faults points fit shell physics film smooth
-    benchmark law figures ladder gym gradients walls planning programs env gallery descent ground
-    limits footprint scene force cluster fused feet frames pages study
+    derivatives push_page pose replay lowering sweep export native faults view bags cli learning
+    benchmark finger tune smooth contact_derivatives rooms library examples drives fit
+    drive_commands mjx_gradients failures support robot ros2 task_commands trial rivals video film
+    tasks house package_laws ground gpu_writer gallery gym descent cluster shell ladder study
+    programs evaluate scene env random_laws law_files figures footprint planning skin feet floors
+    limits law notebooks transformations physics fused walls publish quasistatic
 """
 
 

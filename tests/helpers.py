@@ -124,9 +124,9 @@ def diagonal(*axes: Sequence[Any]) -> list[Any]:
 SEEDS = strategies.integers(0, 2**32 - 1)
 
 
-def property_test(*arguments: strategies.SearchStrategy, examples: int = 40) -> Callable[..., Any]:
+def property_test(*arguments: strategies.SearchStrategy) -> Callable[..., Any]:
     """Return a decorator that runs a test for random arguments."""
-    settings = hypothesis.settings(max_examples=examples, deadline=None)
+    settings = hypothesis.settings(max_examples=16, deadline=None)
     return lambda test: settings(hypothesis.given(*arguments)(test))
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from helpers import SLOTS, slow
+from helpers import SLOTS
 
 import rps_jax
 from rps_jax import Rules, Setting
@@ -111,7 +111,7 @@ def test_the_ladder_and_the_score_use_the_laws_that_the_base_can_follow():
     assert set(Ladder(robot=robot).chosen) == set(known)
 
 
-@pytest.mark.parametrize("drive", ["differential", slow("car")])
+@pytest.mark.parametrize("drive", ROBOTS)
 def test_the_ceiling_plans_without_a_sideways_velocity(drive):
     small = {"sample": 2, "samples": 4, "rounds": 1}
     setting = Setting(rules=Rules(horizon=2.0))
@@ -121,6 +121,7 @@ def test_the_ceiling_plans_without_a_sideways_velocity(drive):
     assert results["mean"].sel(axis="omega").values.any()
 
 
+@pytest.mark.slow
 def test_a_law_is_learned_with_actions_of_two_numbers(tmp_path):
     small = {"network": "mlp", "width": 4, "num_envs": 4, "num_steps": 2, "num_minibatches": 1}
     small |= {"drawn": 4, "validation": 2, "minutes": 0, "updates": 1}

@@ -65,9 +65,11 @@ def compiled(compiler, source, *options):
 # --- C -------------------------------------------------------------------------------------
 
 
-# The steps of rps are in rps_plus.
+QUICK = ("rps_plus", "force_push_published", "learned_small", "unicycle", "pose")
+
+
 @pytest.mark.parametrize(
-    "name", [slow(x) if x == "rps" else x for x in LAWS if x not in ("nps", "learned")]
+    "name", [x if x in QUICK else slow(x) for x in LAWS if x not in ("nps", "learned")]
 )
 def test_a_law_in_c_agrees_with_jax(name, tmp_path):
     result = agreement(name, "double", 10_000, tmp_path)
@@ -110,7 +112,11 @@ def test_a_fault_in_c_is_detected(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "compiler"), diagonal(("rps_plus", "learned_small", "pose", CUSTOM), COMPILERS)
+    ("name", "compiler"),
+    [
+        *diagonal(("rps_plus", "learned_small"), COMPILERS),
+        *(slow(x, c) for x in ("pose", CUSTOM) for c in COMPILERS),
+    ],
 )
 def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path, registries):
     exported = program.program(name, "kairos")
@@ -187,7 +193,7 @@ def test_no_number_of_the_header_is_converted_without_a_cast(name, tmp_path, reg
         output_of("gcc", *strict, "-fsyntax-only", tmp_path / "main.c")
 
 
-@pytest.mark.parametrize("name", ["learned", "rps_plus"])
+@pytest.mark.parametrize("name", [slow("learned"), "rps_plus"])
 def test_the_header_and_the_page_state_the_stack(name, tmp_path):
     exported = program.program(name, "kairos")
     for file, text in folder.files(exported, "law").items():

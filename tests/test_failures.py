@@ -325,6 +325,7 @@ def test_the_regression_set_is_small_hard_and_diverse():
     assert (~failed).any(axis=0).sum() > 50  # some law succeeds
 
 
+@pytest.mark.slow
 def test_a_law_of_the_file_succeeds_again():
     """Outcomes of hard worlds are chaotic: another processor may change a few."""
     results = rps_jax.regress({"again": RPSPlusParams()}, worlds=6, slots=8)

@@ -120,7 +120,7 @@ test_a_load_cell_refuses_invalid_parameters = refusals(
 )
 
 
-@pytest.mark.parametrize("engine", ["fused", "mujoco"])
+@pytest.mark.parametrize("engine", ["fused", slow("mujoco")])
 def test_a_law_observes_the_force_of_its_push(engine):
     """Straight ahead, the law reads the force that slides a box of 10 kg."""
     gains = PublishedForcePushParams(k_theta=-1.0, k_y=0.0)

@@ -520,6 +520,7 @@ def test_a_folder_of_another_run_and_damaged_parts(learned):
     assert len(list((folder / "parts").glob("*.corrupt"))) == 1
 
 
+@pytest.mark.slow
 def test_a_sweep_agrees_with_the_environment(learned, registries):
     """Both have equal worlds, actions and sensing, and so equal outcomes."""
     name, params = registry.parse_law(str(learned[0] / "policy.npz"))

@@ -44,7 +44,7 @@ def identical(a, b):
 # --- sweeps --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("engine", ["fused", "mujoco"])
+@pytest.mark.parametrize("engine", ["fused", slow("mujoco")])
 def test_a_sweep_in_memory_is_the_same_as_one_in_a_folder(engine, tmp_path):
     setting = rps_jax.Setting(engine, rules=RULES, seed=3)
     options = {"worlds": 8, "setting": setting, "part": 4, "slots": SLOTS}
@@ -84,7 +84,9 @@ STORED = {  # from the run folder of a sweep and a new folder, the answer of a c
 DOMAIN_TEXTS = {"push": None, "regress": "wide", "tune_es": "wide"}  # the rest: `DRUMS`
 
 
-@pytest.mark.parametrize("name", [slow(x) if x in ("score", "gallery") else x for x in STORED])
+@pytest.mark.parametrize(
+    "name", [x if x in ("push", "replay", "merge", "tune_es") else slow(x) for x in STORED]
+)
 def test_stored_results_are_those_of_the_call_and_of_xarray(name, run, tmp_path):
     answer, path = STORED[name](run[0], tmp_path / "run"), tmp_path / "run" / "results.nc"
     assert {"command", "version", "seed", "engine"} <= answer.attrs.keys()

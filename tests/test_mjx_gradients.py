@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import ROOT
+from helpers import ROOT, slow
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -38,6 +38,7 @@ from rps_jax.world.scene import WorldInputs
 
 BOX = """<body pos="0 0 0.0985"><freejoint/>
 <geom type="box" size="0.2 0.15 0.1" mass="2" friction="0.6"/></body>"""
+BALL = """<body pos="0 0 0.098"><freejoint/><geom size="0.1" mass="1" friction="0.6"/></body>"""
 # A thigh between limits, with friction, and an ankle with a limit; the foot is a capsule.
 LEG = """<body pos="1 0 0.446"><joint type="slide" axis="0 0 1"/>
 <joint type="slide" axis="1 0 0" damping="1"/><geom type="sphere" size="0.05" mass="3"/>
@@ -90,11 +91,11 @@ def differences(function, x, h=1e-6, steps=1):
     return (up - down).T / (2 * h)
 
 
-@pytest.fixture(scope="module")
-def compiled_box():
-    """A box on a plane, with programs: step of MJX, our step, its derivatives."""
+@pytest.fixture(scope="module", params=[BALL, slow(BOX)])
+def compiled_body(request):
+    """A body on a plane, with programs: step of MJX, our step, its derivatives."""
     with jax.enable_x64(True):
-        case = Case(BOX)
+        case = Case(request.param)
         ours = partial(case.next_state, mjx_gradients.step)
         case.theirs = jax.jit(jax.vmap(partial(case.next_state, mjx.step)))
         case.ours, case.jacobian = jax.jit(jax.vmap(ours)), jax.jit(jax.jacrev(ours))
@@ -103,52 +104,52 @@ def compiled_box():
 
 
 @pytest.fixture
-def box(compiled_box):
+def body(compiled_body):
     with jax.enable_x64(True):
-        yield compiled_box
+        yield compiled_body
 
 
 @pytest.mark.slow
-def test_derivatives_of_1_and_100_steps_of_a_box_on_a_plane_are_central_differences(box):
-    """The box falls, slides and turns; derivatives of 100 steps are a product of matrices."""
-    x = start = box.state(4.0, 1.0, 0.0, 0.2, 0.3, 3.0)
+def test_derivatives_of_1_and_100_steps_on_a_plane_are_central_differences(body):
+    """The body falls, slides and turns; derivatives of 100 steps are a product of matrices."""
+    x = start = body.state(4.0, 1.0, 0.0, 0.2, 0.3, 3.0)
     product = np.eye(x.size)
     for i in range(100):
-        matrix = box.jacobian(x)
-        product, x = matrix @ product, box.ours(x[None])[0]
+        matrix = body.jacobian(x)
+        product, x = matrix @ product, body.ours(x[None])[0]
         if i in (0, 99):
-            expected = differences(box.theirs, start, steps=i + 1)
+            expected = differences(body.theirs, start, steps=i + 1)
             atol = 2e-3 * np.abs(expected).max()
             assert_allclose(product, expected, rtol=0, atol=atol)
     assert np.linalg.norm(x[7:9]) > 0.1  # it still slides
 
 
-def some_states(box):
-    """Return random states of a box near the ground (28, 14)."""
-    return box.state(*np.zeros(6)) + 0.01 * default_rng(0).normal(size=(28, 14))
+def some_states(body):
+    """Return random states of a body near the ground (28, 14)."""
+    return body.state(*np.zeros(6)) + 0.01 * default_rng(0).normal(size=(28, 14))
 
 
-def test_values_are_those_of_mjx_bit_for_bit(box):
-    states = some_states(box)
-    assert_array_equal(box.ours(states), box.theirs(states))
+def test_values_are_those_of_mjx_bit_for_bit(body):
+    states = some_states(body)
+    assert_array_equal(body.ours(states), body.theirs(states))
 
 
 @pytest.mark.slow
-def test_both_modes_agree(box):
-    states, rng = some_states(box), default_rng(1)
+def test_both_modes_agree(body):
+    states, rng = some_states(body), default_rng(1)
     for x, way in zip(states[:4], rng.normal(size=(4, 14)), strict=True):
-        expected = np.asarray(box.jacobian(x)) @ way
-        assert_allclose(box.forward(x, way), expected, rtol=1e-9, atol=1e-9)
+        expected = np.asarray(body.jacobian(x)) @ way
+        assert_allclose(body.forward(x, way), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_in_the_air_friction_has_no_effect_and_a_body_at_rest_can_turn(box):
+def test_in_the_air_friction_has_no_effect_and_a_body_at_rest_can_turn(body):
     """The derivative by an angular velocity of zero, which that of MJX lacks."""
-    x = box.state(*np.zeros(6))
+    x = body.state(*np.zeros(6))
     x[2] += 1.0
-    matrix = box.jacobian(x)
+    matrix = body.jacobian(x)
     assert_array_equal(matrix[:-1, -1], 0.0)
     assert_allclose(matrix[4:7, 10:13], 0.002 * np.eye(3), atol=1e-12)
-    assert_allclose(matrix[:-1], differences(box.theirs, x)[:-1], atol=1e-7)
+    assert_allclose(matrix[:-1], differences(body.theirs, x)[:-1], atol=1e-7)
 
 
 # --- our worlds ---
@@ -348,7 +349,6 @@ QUICK_JIT = partial(jax.jit, compiler_options=QUICK)
 # MJX refuses elliptic cones in a model without contacts.
 PENDULUM = """<body pos="2 0 1"><joint axis="0 1 0" range="-30 30" limited="true" damping="0.1"
 frictionloss="0.01"/><geom pos="0 0 -0.4" size="0.03" contype="0" conaffinity="0"/></body>"""
-BALL = """<body pos="0 0 0.098"><freejoint/><geom size="0.1" mass="1" friction="0.6"/></body>"""
 
 SLIDING = (0.0, 0.0, 0.098, 1.0, 0.0, 0.0, 0.0, 0.5, 0.2, -0.5, 1.0, 2.0, 3.0)
 
@@ -610,9 +610,9 @@ def test_the_package_of_the_file_has_the_versions_of_this_package():
     assert single["requires-python"].startswith(whole["requires-python"].partition(",")[0])
 
 
-def test_models_without_derivatives_are_refused(box):
+def test_models_without_derivatives_are_refused(body):
     with pytest.raises(ValueError, match=r"model = mjmodel .*put_model\(model, impl='jax'"):
-        mjx_gradients.solve(box.plain, box.data)
+        mjx_gradients.solve(body.plain, body.data)
 
 
 def test_third_derivatives_are_refused():

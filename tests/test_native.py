@@ -82,9 +82,9 @@ def close(actual, desired, warm, rest):
         assert_allclose(a, b, rtol=1e-4, atol=rest)
 
 
+@pytest.mark.slow  # below, a whole sweep agrees with XLA
 @pytest.mark.parametrize(
-    ("shape", "skin"),
-    [("cylinder", "ideal"), *(slow(x, "capacitive") for x in ("box", "prism"))],
+    ("shape", "skin"), [("cylinder", "ideal"), ("box", "capacitive"), ("prism", "capacitive")]
 )
 def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
     stage, inputs, loop, pushing = build_push(shape, skin)
@@ -95,7 +95,7 @@ def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
 
 
 @pytest.mark.parity
-@pytest.mark.parametrize("shape", ["prism", slow("cylinder")])
+@pytest.mark.parametrize("shape", ["cylinder", slow("prism")])
 def test_the_bits_of_a_world_depend_on_no_other_world(shape):
     stage, inputs, loop = batch(shape)
     together = advanced(stage, inputs, start_trials(inputs, loop), loop, 300)
@@ -424,7 +424,7 @@ def test_a_law_of_the_package_is_not_compared(monkeypatch):
 @pytest.mark.parity
 def test_a_sweep_of_a_custom_law_is_a_push_in_xla(mine, tmp_path, monkeypatch):
     setting = setting_of(8.0, "fused")
-    swept = sweep("mine", "wide,objects=box,gap=0.01", worlds=2, setting=setting, out=tmp_path)
+    swept = sweep("mine", "wide,objects=cylinder,gap=0.01", worlds=2, setting=setting, out=tmp_path)
     monkeypatch.setenv("RPS_COMPILER", "none")
     pushed = replay(tmp_path, 1)
     ends = swept.isel(world=1).squeeze()

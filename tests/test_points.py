@@ -118,15 +118,6 @@ def some_points():
     return u
 
 
-def test_objects_may_come_in_any_order(tmp_path):
-    u = some_points()
-    options = {"setting": replace(SHORT, engine="quasistatic"), "part": 2, "slots": SLOTS}
-    swept = rps_jax.sweep("rps", BOTH, points=u, out=tmp_path, **options)
-    assert swept.object.values.tolist() == ["random_cylinder"] * 4 + ["random_box"]
-    assert (swept.corners.values == [0, 0, 0, 0, 4]).all()
-    assert (swept.time.values > 0).all()
-
-
 def test_points_that_are_none_are_refused(tmp_path, capsys):
     u = points.points_of("wide", np.arange(2))
     for wrong, words in (

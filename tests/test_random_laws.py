@@ -17,6 +17,7 @@ from rps_jax.engines import native
 
 pytestmark = pytest.mark.skipif(native.target() is None, reason="there is no C compiler")
 SEEDS = 20  # of one compilation
+FEW = 7  # in all runs of the tests
 COUNT = 4  # numbers of a vector
 SPECIAL = [0.0, -0.0, np.nan, np.inf, -np.inf]
 BOUNDS = [2**31 - 1, -(2**31), -1, 0, 31, 32]
@@ -202,11 +203,11 @@ def wrong_seeds(seeds):
 
 @pytest.mark.parity
 def test_random_programs_are_those_of_xla():
-    assert wrong_seeds(range(SEEDS)) == []
+    assert wrong_seeds(range(FEW)) == []
 
 
 @pytest.mark.slow
 def test_many_random_programs_are_those_of_xla():
     count = int(os.environ.get("RPS_SEEDS", "400"))
-    groups = [range(first, first + SEEDS) for first in range(SEEDS, SEEDS + count, SEEDS)]
+    groups = [range(first, first + SEEDS) for first in range(FEW, FEW + count, SEEDS)]
     assert [seed for group in groups for seed in wrong_seeds(group)] == []

@@ -24,13 +24,12 @@ from rps_jax.trials.trial import ControlLoop
 from rps_jax.world.domain import DOMAINS
 
 WORLDS = 5
-FEW = 4  # of other laws, tasks and engines
 SLOTS = 3  # two batches, and a number that only the record of the run has
 
 
 def sweep(folder, law, domain, task="reach", engine="fused", horizon=4.0, **options):
     setting = setting_of(horizon, engine)
-    names = {"task": task, "setting": setting, "worlds": FEW, "slots": SLOTS}
+    names = {"task": task, "setting": setting, "worlds": WORLDS, "slots": SLOTS}
     return rps_jax.sweep(law, domain, out=folder, **names | options)
 
 
@@ -42,9 +41,9 @@ def assert_equal_bits(outcomes, results):
         assert_array_equal(np.asarray(values, expected.dtype), expected, err_msg=name)
 
 
-def replayed(run, law, worlds):
-    """Return the outcomes of replays of the first worlds, by name."""
-    columns = [rps_jax.replay(run, i, law).outcome.columns() for i in range(worlds)]
+def replayed(run, law):
+    """Return the outcomes of replays of all worlds, by name."""
+    columns = [rps_jax.replay(run, i, law).outcome.columns() for i in range(WORLDS)]
     return {name: np.stack([x[name] for x in columns]) for name in columns[0]}
 
 
@@ -57,11 +56,6 @@ CASES = {
         "fused",
         1.0,
     ),
-    "a law that senses force, on a robot with limits in a corridor": (
-        "force_push_published",
-        "real,objects=random_cylinder",
-        "corridor,width=2:2.2,length=8:10",
-    ),
     "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
 }
 HALL = {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]], "start": [1.5, 3, 0], "goal": [7, 3]}
@@ -70,6 +64,11 @@ TASKS = {
     "rooms": HALL,
 }  # with places for the widest object
 SLOW_CASES = {
+    "a law that senses force, on a robot with limits in a corridor": (
+        "force_push_published",
+        "real,objects=random_cylinder",
+        TASKS["corridor"],
+    ),
     "MJX": ("rps", "wide,objects=random_box", "reach", "mjx", 1.0),
     "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),
     **{
@@ -91,7 +90,7 @@ QUICK = [pytest.param(x, marks=[pytest.mark.parity] * (k == COMPILED)) for k, x 
 def test_a_replay_has_the_bits_of_its_sweep(case, tmp_path):
     results = sweep(tmp_path, *case)
     with warnings.catch_warnings(action="error"):
-        assert_equal_bits(replayed(tmp_path, case[0], FEW), results.sel(law=case[0]))
+        assert_equal_bits(replayed(tmp_path, case[0]), results.sel(law=case[0]))
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +114,7 @@ def test_the_bits_depend_on_the_stored_number_of_slots(run):
 @pytest.mark.parity
 def test_replays_in_a_planar_engine_have_the_bits_of_their_sweep(run):
     folder, results = run
-    assert_equal_bits(replayed(folder, "rps", WORLDS), results)
+    assert_equal_bits(replayed(folder, "rps"), results)
 
 
 def test_a_gallery_has_the_bits_of_its_sweep(run):

@@ -394,14 +394,10 @@ def test_a_law_refuses_invalid_parameters_and_restores_valid_ones(name):
     assert type(restored) is type(params)
 
 
-# Laws whose successes other tests assert, and variants of other laws here.
-ELSEWHERE = {"pose", "path_pose", "rps_plus", "unicycle", "path_pose_drive", "learned"}
-
-
 @pytest.mark.parametrize(
     "name",
     [
-        slow(x) if x in ELSEWHERE else x
+        x if x in ("force_push", "pursuit") else slow(x)
         for x in sorted(RIVALS.keys() - {"force_push_published", "learned_mlp"})
     ],
 )

@@ -138,7 +138,7 @@ def position_after(twist, seconds):
 
 
 @pytest.mark.usefixtures("steady")
-@pytest.mark.parametrize("engine", ["fused", slow("mjx"), "mujoco", "quasistatic"])
+@pytest.mark.parametrize("engine", ["fused", *map(slow, ("mjx", "mujoco", "quasistatic"))])
 def test_a_base_turns_and_strafes_less_than_commanded_in_all_engines(engine):
     """Away from the object; the fused engine is compiled C."""
     commands = ((0.1, 0.0, 0.5), (0.1, 0.0, 0.0), (0.1, 0.05, 0.5))

@@ -228,7 +228,7 @@ def test_a_path_replaces_the_target_until_it_ends(driven):
     ("law", "robot"),
     [
         ("rps_plus", "ideal"),
-        ("unicycle", "turtlebot4"),
+        slow("unicycle", "turtlebot4"),
         ("unicycle_car", "f1tenth"),
         ("pose", "ideal"),
     ],

@@ -27,6 +27,7 @@ from helpers import (
     property_test,
     refusing,
     setting_of,
+    slow,
 )
 from helpers import box as box_at
 from jax.flatten_util import ravel_pytree
@@ -51,7 +52,7 @@ COLD = Temperatures(1e-6, 1e-6, 1e-6, 1e-6)
 WORLDS = 256
 
 
-any_seed = property_test(SEEDS, examples=30)
+any_seed = property_test(SEEDS)
 
 
 # The law
@@ -437,7 +438,7 @@ def push(case: Case, law, horizon: float):
     return jax.tree.map(lambda x: np.asarray(x)[0], trials)
 
 
-@pytest.mark.parametrize("name", ["box", "cylinder"])
+@pytest.mark.parametrize("name", [slow("box"), "cylinder"])
 def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     """The push starts before the first touch and turns towards a target at the side."""
     start = case((1.0, -1.5), name, gap=0.005)
@@ -451,7 +452,9 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     assert got.min_distance == pytest.approx(exact.min_distance, abs=2e-3)
 
 
-@pytest.mark.parametrize("law", [rps.LAW, registry.smooth_law(rps.LAW)], ids=["hard", "smooth"])
+@pytest.mark.parametrize(
+    "law", [slow(rps.LAW), registry.smooth_law(rps.LAW)], ids=["hard", "smooth"]
+)
 def test_with_a_warm_skin_a_push_arrives(law):
     """Both laws succeed; the hard law reads the binary contact."""
     ended = push(case((0.7, 0.05), skin=SMOOTH), law, 30.0)

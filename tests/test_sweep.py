@@ -240,7 +240,7 @@ def test_results_hold_every_world_with_its_drawn_quantities(whole, tmp_path):
 
 # C MuJoCo compiles little, so that a process is soon at work.
 BRIEF = replace(SHORT, engine="mujoco", rules=Rules(horizon=3.0))
-KILLED = replace(PLAN, domain=replace(CYLINDERS, skin="ideal"), worlds=40, setting=BRIEF, part=5)
+KILLED = replace(PLAN, domain=replace(CYLINDERS, skin="ideal"), worlds=20, setting=BRIEF, part=5)
 
 
 def sweep_in_a_process(folder):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import advance, case, jitted
+from helpers import advance, case, jitted, slow
 from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.analysis import statistics
@@ -96,7 +96,7 @@ def sequential():
     return run(FAMILIES, LONGER)
 
 
-@pytest.mark.parametrize("tail_slots", [1, 3, SLOTS])
+@pytest.mark.parametrize("tail_slots", [slow(1), 3, SLOTS])
 def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, sequential, tail_slots):
     """The last trials in 1, 3 or as many slots as before."""
     segments, ran, plain = [], [], batch._Program.compiled
@@ -256,7 +256,7 @@ def test_before_the_first_touch_the_base_creeps_without_lost_contact(advanced):
     assert np.isinf(healthy.min_distance[0])
 
 
-@pytest.mark.parametrize("engine", ["fused", "mujoco"])
+@pytest.mark.parametrize("engine", ["fused", slow("mujoco")])
 def test_the_trace_of_a_trial_agrees_with_its_outcome(engine):
     setting = replace(FUSED, engine=engine, rules=Rules(horizon=24.0))
     worlds = pushes.build([case(NEAR, skin=CapacitiveSkin())], setting)

@@ -256,7 +256,7 @@ def test_a_target_has_handles_where_it_can_be_moved(page, task, monkeypatch):
 
 
 def test_the_panel_of_a_task_has_progress_and_touch(page):
-    waypoints = [[0.4, 0.0], [2.0, 0.0], [3.2, 1.2]]
+    waypoints = [[0.4, 0.0], [1.0, 0.0], [2.2, 1.2]]
     task = {"kind": "corridor", "waypoints": waypoints, "width": 0.9, "lookahead": 3}
     setting = setting_of(60.0)
     live = viewer.View("cylinder", task=task, setting=setting).push().live

@@ -68,7 +68,11 @@ def slid(family: str, engine: str, physics: Physics) -> Recording:
 
 @pytest.mark.parametrize(
     ("family", "engine"),
-    [x for k in ("box", "cylinder", "prism") for x in ((k, "fused"), slow(k, "mjx"))],
+    [
+        (x, engine) if (x, engine) == ("box", "fused") else slow(x, engine)
+        for x in ("box", "cylinder", "prism")
+        for engine in ("fused", "mjx")
+    ],
 )
 def test_slides_along_walls_agree_with_c_mujoco(family, engine):
     computed, expected = slid(family, engine, STANDARD), slid(family, "mujoco", REFERENCE)
