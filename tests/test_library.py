@@ -3,6 +3,7 @@
 import doctest
 import inspect
 import pkgutil
+import re
 import sys
 
 import pytest
@@ -180,6 +181,14 @@ LONG |= {"value_and_grad", "rollout", "gallery", "fit", "paper", "tune_grad", "f
 
 def mark_long(name):
     return pytest.param(name, marks=[pytest.mark.slow] if name in LONG else [])
+
+
+def test_jupyter_shows_the_help_of_each_argument_of_a_call():
+    for call in (x for name in rps_jax.__all__ if hasattr(x := getattr(rps_jax, name), "getdoc")):
+        signature = inspect.signature(call)
+        documented = re.findall(r"^  (\w+): \w", call.getdoc(), re.MULTILINE)
+        assert signature.parameters.keys() <= {*documented}
+        assert not re.search(r"Spec\(|Named\(", str(signature))
 
 
 @pytest.mark.parametrize("name", [mark_long(name) for name in PUBLIC if examples(name)])

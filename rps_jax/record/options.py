@@ -71,6 +71,19 @@ def _types_of(kind: Hint) -> tuple[dict[str, Hint], dict[str, Named]]:
     return typing.get_type_hints(kind), {k: x for k, x in named.items() if x and x.closed}
 
 
+@functools.cache  # tyro parses the source of a class for each of its fields
+def help_of(kind: type, name: str) -> str:
+    """Return the help of a field: its declaration or docstring, and names that a text may have."""
+    from tyro import _docstrings
+
+    if (spec := specs_of(kind).get(name)) is not None and spec.about:
+        has_unit = spec.unit in ("", "1") or f"[{spec.unit}]" in spec.about
+        return spec.about if has_unit else str(spec)
+    named = annotation_in(typing.get_type_hints(kind, include_extras=True)[name], Named)
+    names = f" Names: {', '.join(named.names())}." if named and not named.closed else ""
+    return (_docstrings.get_field_docstring(kind, name, ()) or "") + names
+
+
 def check_fields(record: object, prefix: str = "") -> None:
     """Check the fields of a dataclass by their types and bounds; errors name them after a prefix.
 

@@ -23,6 +23,8 @@ import functools
 import inspect
 import itertools
 import re
+import textwrap
+import types
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -36,6 +38,7 @@ from typing import (
     ParamSpec,
     Self,
     TypeVar,
+    get_type_hints,
 )
 
 import jax
@@ -101,7 +104,30 @@ def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
 
     call.__name__ = call.__qualname__ = snake_case(command.__name__)
     call.__doc__ = f"{command.__doc__}\n\nFields of `{command.__name__}` are its arguments.\n"
+    help_of_arguments = functools.partial(_document, command, call.__doc__)
+    vars(call).update(__signature__=_plain_signature(command), getdoc=help_of_arguments)
     return call
+
+
+def _plain_signature(command: Any) -> inspect.Signature:
+    """Return the signature of a command's function, whose annotations have no declarations."""
+    signature = inspect.signature(command)
+    declared = {name: x.annotation for name, x in signature.parameters.items()}
+    evaluated = {name: x for name, x in declared.items() if not isinstance(x, str)}
+    plain = declared | get_type_hints(types.SimpleNamespace(__annotations__=evaluated))
+    arguments = [x.replace(annotation=plain[name]) for name, x in signature.parameters.items()]
+    answer = inspect.get_annotations(getattr(command, "answer", command)).get("return")
+    return signature.replace(parameters=arguments, return_annotation=answer or "Any")
+
+
+def _document(command: Any, text: str) -> str:
+    """Return the documentation of a command's function with its arguments, which IPython shows."""
+    rows = (
+        f"{name}: {options.help_of(command, name)}"
+        for name in inspect.signature(command).parameters
+    )
+    wrap = functools.partial(textwrap.fill, initial_indent="  ", subsequent_indent="    ")
+    return "\n".join([inspect.cleandoc(text), "", "Args:", *map(wrap, rows)])
 
 
 def _check_argument(name: str, known: Collection[str], function: str) -> None:
@@ -463,6 +489,7 @@ class SimulationQuestion(TrialQuestion[T]):
     """Base class of questions that run trials with one setting."""
 
     setting: Setting = Setting()
+    """Engine, physics, fidelity, rules and seed of all trials."""
 
     def __post_init__(self) -> None:
         """Set the control period of the robot, and laws that suit it."""

@@ -122,6 +122,8 @@ class Tuning(DomainsQuestion, LawQuestion[xr.Dataset]):
     validation: int = option(512, 1, 10_000_000)
     """Number of worlds for validation, in each domain."""
     objective: Objective = Objective()
+    """Score of a trial: a success scores its time, and a failure one more and the distance by which
+    it missed the target. Both score the time without contact."""
     budget: float = option(0.0, 0, unit="s")
     """Simulated time after which no generation starts [s]; 0 means no limit."""
     minutes: float = option(0.0, 0, unit="min")

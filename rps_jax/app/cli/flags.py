@@ -6,7 +6,6 @@ without a prefix.
 """
 
 import dataclasses
-import functools
 import types
 import typing
 from collections.abc import Iterator, Sequence
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import tyro
-from tyro import _docstrings, _errors
+from tyro import _errors
 from tyro.constructors import (
     ConstructorRegistry,
     PrimitiveConstructorSpec,
@@ -39,7 +38,6 @@ from rps_jax.runs.question import (
     current_names,
     quick_command,
 )
-from rps_jax.spec import Named, Spec, annotation_in, specs_of
 from rps_jax.trials.setting import PhysicsField, Setting
 from rps_jax.trials.trial import Rules
 
@@ -194,20 +192,16 @@ def _texts(value: object) -> list[str]:
     return [*map(str, value)] if isinstance(value, tuple | list) else [str(value)]
 
 
-# tyro parses the source of a class for each of its fields.
-_field_docs = functools.cache(_docstrings.get_field_docstring)
-
-
 @_REGISTRY.struct_rule
 def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Offer the fields of a dataclass, without the hidden ones."""
     is_tuple = hasattr(info.type, "_fields")
     if not (is_tuple or dataclasses.is_dataclass(info.type)):
         return None
-    types_, declared = options.field_types(info.type), specs_of(info.type)
+    types_ = options.field_types(info.type)
     if is_tuple:
         rows = ((x, types_[x], getattr(info.default, x)) for x in info.type._fields)
-        fields = (StructFieldSpec(*row, _help_of(declared[row[0]])) for row in rows)
+        fields = (StructFieldSpec(*row, options.help_of(info.type, row[0])) for row in rows)
         return StructConstructorSpec(info.type, tuple(fields))
     specs = []
     for field in _offered(info.type):
@@ -224,24 +218,9 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
             kind = tuple[get_args(kind)[0], ...]
         marked = typing.cast(type, Annotated[(kind, *marks)] if marks else kind)
         # The help has no text of a group, which tyro would read from the source at once.
-        text = "" if is_group else partial(_text_of, info.type, field.name, info.markers)
-        if (spec := declared.get(field.name)) is not None and spec.about:
-            text = _help_of(spec)
+        text = "" if is_group else partial(options.help_of, info.type, field.name)
         specs.append(StructFieldSpec(field.name, marked, default, text))
     return StructConstructorSpec(info.type, tuple(specs))
-
-
-def _text_of(kind: type, name: str, markers: tuple[object, ...]) -> str:
-    """Return the help of a field: its docstring, and the names that its texts may begin with."""
-    named = annotation_in(typing.get_type_hints(kind, include_extras=True)[name], Named)
-    names = f" Names: {', '.join(named.names())}." if named and not named.closed else ""
-    return (_field_docs(kind, name, markers) or "") + names
-
-
-def _help_of(spec: Spec) -> str:
-    """Return the help of a declared number, with its unit."""
-    has_unit = spec.unit in ("", "1") or f"[{spec.unit}]" in spec.about
-    return spec.about if has_unit else str(spec)
 
 
 def _offered(kind: type) -> list[dataclasses.Field[object]]:
