@@ -105,7 +105,8 @@ def test_friction_above_the_slope_leaves_only_the_creep_of_soft_contacts(engine)
     # four feet has the stiffness d / (1 - d) m; friction has impratio times that.
     d, (time, _) = physics.ground_impedance, physics.ground_solref
     damping = 4 * physics.impratio * d / (1 - d) * 2 / (d * time)  # [1/s] over the mass
-    assert qvel[-1, 4] == pytest.approx(G * math.sin(STEEP) / damping, rel=0.02)
+    creep = between(qvel[:, 4], 2, 4)  # float32 alternates between steps
+    assert creep == pytest.approx(G * math.sin(STEEP) / damping, rel=0.02)
     assert 0 < qpos[-1, 4] < 0.012
 
 
