@@ -124,6 +124,7 @@ COMMANDS = {
         "--fidelity best": unlike("--fidelity", "best", "reference", "standard", "fast"),
     },
     "push": {
+        "--friction 0.3": "unknown friction set '0.3': choose from S1, S2, or give GROUND,ROBOT",
         "--bag push.txt": "bag = push.txt is not allowed: name a file, as push.mcap",
         "--target 0 0": "target = .* outside the robot",
         "--target 1": "target",
@@ -189,6 +190,7 @@ COMMANDS = {
     "ceiling": {
         "lacking": "run = lacking does not hold a sweep: give the folder of",
         "run --robot turtlebot4": "robot = turtlebot4 is not allowed: the run has its own",
+        "--lost-by rps": "only a run has laws",
         "run --horizon 4": "horizon = 4.0 is not allowed: the run has its own",
     },
     "view": {
@@ -198,6 +200,7 @@ COMMANDS = {
     },
     "film": {
         "": "run is missing: `rps film --help` lists the options",
+        "run --law rps --laws rps": "law = rps is not allowed: laws name those that are filmed",
         "run --grid 4x": "grid = 4x is not allowed: write ROWSxCOLUMNS, as 4x6, each from 1 to 12",
         "run --grid 0x3": "grid = 0x3 is not allowed: write ROWSxCOLUMNS",
         "run --grid 4x99": "grid = 4x99 is not allowed",
@@ -210,6 +213,7 @@ COMMANDS = {
     },
     "tune": {
         "es --objects sphere": "unknown domain object 'sphere'",
+        "es --sigma 0.4": "sigma = 0.4 is not allowed: only the estimator antithetic has it",
         "es --law aps": "its parameters have no bounds",
         "es --tuned mass": "unknown tuned parameter 'mass': choose from eta",
         "es --tuned L L": "tuned = .* is not allowed: name each once",
@@ -240,6 +244,7 @@ COMMANDS = {
     "shadow": {"none.mcap": "give FILE.mcap"},
     "fit": {"none.csv": "none.csv cannot be read"},
     "puhs": {"": "puhs"},
+    "hello.py puhs": {"": "unknown command 'puhs': .*did you mean 'push'"},
 }
 TASKS = {
     "push --task nofile.json": "nofile.json cannot be read",
@@ -274,6 +279,7 @@ def folder(tmp_path_factory):
     """Inputs of the cases: invalid files of all kinds, and one run of three worlds."""
     root = tmp_path_factory.mktemp("bad")
     (root / "file").touch()
+    (root / "hello.py").touch()
     (root / "hello.npz").write_bytes(b"hello")
     (root / "text.json").write_text("mass = 3")
     (root / "binary.json").write_bytes(b"\xff\xfe\x00")

@@ -24,7 +24,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.robot.robot import ROBOTS
 from rps_jax.robot.skin import SKINS
-from rps_jax.runs.question import OutputCommand
+from rps_jax.runs.question import OutputCommand, QuickQuestion
 from rps_jax.runs.sweep import merge
 from rps_jax.trials.results import DIMS
 from rps_jax.tuning.evolution import TuneES
@@ -285,6 +285,12 @@ def test_a_quick_run_keeps_an_explicit_value_that_equals_the_default():
     assert (called.worlds, called.tuned, called.population) == (7, ("logistic",), quick.population)
     assert called.setting.engine == small["setting.engine"]
     assert default.with_quick_values() == default
+
+
+def test_each_command_with_a_quick_run_has_a_smaller_one():
+    kinds = map(names.question_type, names.known())
+    quick = {x().name: x() for x in kinds if issubclass(x, QuickQuestion)}
+    assert {x for x, command in quick.items() if not command.quick_values()} == {"push", "paper"}
 
 
 @pytest.mark.parametrize("name", [x for x, law in LAWS.items() if registry.law_of(law).bounds])

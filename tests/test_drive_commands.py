@@ -16,7 +16,7 @@ from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import Network
 from rps_jax.errors import InputError
 from rps_jax.runs.push import Push
-from rps_jax.studies.ladder import Ladder
+from rps_jax.studies.ladder import Ladder, Score
 from rps_jax.tuning.fit import Fit
 
 ROBOTS = {
@@ -109,6 +109,8 @@ def test_the_ladder_and_the_score_use_the_laws_that_the_base_can_follow():
     laws = rps_jax.ladder(("unicycle", "rps"), **options)
     assert laws.drives.values.tolist() == ["omni differential car", "omni"]
     assert set(Ladder(robot=robot).chosen) == set(known)
+    # No law of the package brings objects to a heading with a car.
+    assert list(Score("unicycle_car", robot="f1tenth", task="pose").chosen) == ["unicycle_car"]
 
 
 @pytest.mark.parametrize("drive", ROBOTS)

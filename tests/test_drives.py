@@ -15,6 +15,7 @@ from helpers import ROOT, observation, refusals, refusing, slow
 
 from rps_jax import draw_worlds, engines, rollout
 from rps_jax.app.cli import flags, names
+from rps_jax.app.export.program import program
 from rps_jax.control import registry
 from rps_jax.control.base import Law
 from rps_jax.control.laws import unicycle
@@ -24,7 +25,9 @@ from rps_jax.robot import base as robot_base
 from rps_jax.robot.base import Tyres
 from rps_jax.robot.robot import ROBOTS, Robot, parse_robot
 from rps_jax.robot.skin import NONE
+from rps_jax.runs.model_panel import model_plans
 from rps_jax.runs.sweep import Sweep
+from rps_jax.studies.attack import Attack
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.env import PushEnv
@@ -440,6 +443,22 @@ def test_calls_of_the_library_take_the_period_of_the_robot():
     world = jax.tree.map(lambda x: x[0], batch.worlds)
     law = registry.LAWS["rps"]
     assert rollout(world, law, batch.stage, horizon=0.5).time.shape == (5,)
+
+
+def test_models_and_checks_keep_the_period_and_the_support_of_a_run():
+    plans = model_plans(Sweep("rps", robot="ideal,period=0.1").plan).values()
+    assert len(plans) > 5
+    assert {x.setting.physics.control_period for x in plans} == {0.1}
+    setting = Setting(physics="default,support=even")
+    physics = Attack(robot="ideal,period=0.1", setting=setting).reference.physics
+    assert (physics.control_period, physics.support, physics.timestep) == (0.1, "even", 0.001)
+
+
+def test_the_time_constant_of_a_robot_is_that_of_its_skin_in_pushes_and_exports():
+    robot = "ideal,time_constant=0.3"
+    assert Case(robot=robot, skin="capacitive").sensor.time_constant == 0.3
+    values = {x.name: x.value for x in program("rps", robot).groups["skin_params"]}
+    assert values["time_constant"] == 0.3
 
 
 def test_a_rollout_refuses_a_law_that_the_base_cannot_follow():

@@ -198,6 +198,13 @@ def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_
         rps_jax.fit_object(SQUARE, table.assign(tip_x=1.0 + table.tip_x), RADIUS)
     with refusing("give 3 to 64 points"):
         rps_jax.fit_object(SQUARE, table, RADIUS, feet=SQUARE[:2])
+    with refusing("prior size deviation = 0.0 is not allowed: .* above 0"):
+        rps_jax.fit_object(SQUARE, table, RADIUS, prior={"size": (0.0, 0.0)})
+    with refusing("without a number for yaw in row 2:"):
+        rps_jax.fit_object(SQUARE, table.assign(yaw=table.yaw.drop(2)), RADIUS)
+    table.assign(tip_x=table.tip_x + 1e-6).to_csv(paths[1], index=False)
+    with refusing("holds another run .inputs"):  # of the same paths
+        rps_jax.fit_object(*paths, RADIUS, out=tmp_path / "run")
     with refusing("lacks "):
         rps_jax.fit_object(SQUARE, table.drop(columns="yaw"), RADIUS)
     table.drop(columns="yaw").to_csv(tmp_path / "pushes.csv")

@@ -159,7 +159,7 @@ test_invalid_options_of_several_environments_are_refused = refusals(
     ({"autoreset_mode": "Never"}, "unknown autoreset_mode 'Never': choose from NextStep"),
     ({"render_mode": "ansi"}, "unknown render_mode 'ansi': choose from rgb_array"),
     ({"wolds": 3}, "unknown option 'wolds': .*did you mean 'worlds'"),
-    ({"domain": 3}, "domain = 3 is not allowed: give a name or a Domain"),
+    ({"domain": 3}, "domain = 3 is not allowed: give a text, as wide, or a Domain"),
     ({"setting": None}, "setting = None is not allowed: give a Setting"),
 )
 

@@ -23,6 +23,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import rps_jax
 from rps_jax.record import files
 from rps_jax.runs.plan import load_plan
+from rps_jax.runs.sweep import Sweep
 from rps_jax.world import draws, points
 from rps_jax.world.domain import DOMAINS, quantities_of
 
@@ -96,6 +97,9 @@ def test_sweeps_and_evaluations_take_points_as_they_take_drawn_worlds(tmp_path):
     tried = rps_jax.evaluate(params, CYLINDERS, points=reversed_, **SWEPT)
     assert_allclose(tried.mass, drawn.mass.values[::-1], rtol=1e-6)
     assert_allclose(tried.time[0], drawn.time[0, ::-1], atol=0.5)
+    quick = Sweep("rps", CYLINDERS, points=u, quick=True).with_quick_values()
+    quick.validate()
+    assert quick.plan.worlds == SLOTS
     # A folder of other points, and a folder with damaged points.
     with refusing("holds another run"):
         rps_jax.sweep("rps", CYLINDERS, points=u[::-1], out=folder, **SWEPT)

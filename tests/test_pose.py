@@ -648,7 +648,7 @@ def test_every_robot_gets_a_law_for_poses_that_suits_its_drive_and_its_front(rob
     base = Robot.parse(robot)
     for task in ("pose", "path,heading=1"):
         if base.drive == "car" or base.radius is not None:
-            with refusing("brings objects to a heading; name one by law"):
+            with refusing("brings objects to a heading; name a custom law"):
                 _ = Case(robot=robot, task=task)
             continue
         name = Case(robot=robot, task=task).named_law

@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -27,6 +28,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Checkpoints
+from rps_jax.runs.sweep import Sweep
 
 TIMES = np.linspace(0, 1, 200, dtype=np.float32).reshape(2, 100)
 RESULTS = xr.Dataset({"time": (("law", "world"), TIMES)}, {"law": ["rps", "nps"]})
@@ -166,6 +168,13 @@ def test_invalid_json_without_checksum_is_reported(content, folder):
         files.checksum_path(path).unlink()
         path.write_bytes(content)
         reports_corruption(path)
+
+
+def test_numbers_of_numpy_and_jax_are_those_of_python_in_a_run(tmp_path):
+    for kind, seed in ((np.float32, np.uint32(3)), (jnp.float32, np.int64(3)), (float, 3)):
+        domain = rps_jax.Domain(mass=rps_jax.Range(kind(4), kind(8)))
+        sweep = Sweep("rps", domain, setting=rps_jax.Setting(seed=seed))
+        run_folder.claim(tmp_path, sweep.configuration())
 
 
 def test_fields_of_later_versions_are_absent_in_older_runs():

@@ -89,6 +89,8 @@ class Film(OutputCommand[Path]):
 
     def check(self) -> None:
         """Check the grid, the file and the selected trials."""
+        if self.laws and self.law is not None:
+            raise errors.not_allowed("law", self.law, "laws name those that are filmed; omit one")
         out = Path(self.out or self.default_folder)
         if out.is_dir():
             raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")

@@ -110,7 +110,7 @@ def law_of(params: LawParams | type) -> Law:
     kind = params if isinstance(params, type) else type(params)
     if kind not in _LAWS_BY_CLASS:
         known = ", ".join(known.__name__ for known in _LAWS_BY_CLASS)
-        fix = f"use {known}, or register the law with register_law"
+        fix = f"give a text, {known}, a list of several, or a law of register_law"
         raise InputError(f"params of class {kind.__name__} belong to no law: {fix}.")
     return _LAWS_BY_CLASS[kind]
 

@@ -105,8 +105,13 @@ def write_csv(path: Path, table: pd.DataFrame) -> Path:
 
 def write_json(path: Path, content: object, *, checked: bool = False) -> Path:
     """Write readable JSON in the order of its keys, with its checksum if `checked`."""
-    text = json.dumps(content, indent=2, allow_nan=True) + "\n"
+    text = json.dumps(content, indent=2, default=plain) + "\n"
     return write_bytes(path, text.encode(), checked=checked)
+
+
+def plain(number: Any) -> object:
+    """Return a number or an array of NumPy or JAX as JSON has it, for `json.dumps`."""
+    return np.asarray(number).tolist()
 
 
 def write_results(path: Path, results: xr.Dataset) -> Path:

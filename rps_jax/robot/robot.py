@@ -404,7 +404,7 @@ def parse_robot(robot: RobotLike) -> Robot:
             values["boards"] = _parse_boards(values["boards"])
         robot = Robot(**values)
     if not isinstance(robot, Robot):
-        rule = 'write names with numbers, as {"force_max": 300}'
+        rule = 'give a name or a file as a text, or numbers by name, as {"force_max": 300}'
         raise errors.not_allowed("robot", repr(robot), rule)
     robot.check()
     return robot

@@ -39,6 +39,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.base import low_pass, normal
+from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import HALF_WIDTH, Shell, side_lengths
 from rps_jax.spec import Named, Spec
 
@@ -389,6 +390,14 @@ def parse_skin(skin: SkinLike) -> Any:
     changed = preset._replace(**changes)
     changed.check()
     return changed
+
+
+def mounted(skin: SkinLike, robot: Robot) -> Any:
+    """Return a skin on the boards of a robot, whose time constant replaces that of the skin."""
+    sensor = parse_skin(skin)._replace(shell=robot.shell)
+    if robot.time_constant is None or "time_constant" not in sensor._fields:
+        return sensor
+    return sensor._replace(time_constant=robot.time_constant)
 
 
 def _first(excess: Array) -> Array:

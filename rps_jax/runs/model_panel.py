@@ -39,10 +39,11 @@ ENGINES: dict[str, EngineName] = {"quasi-static": "quasistatic"}  # the rest: th
 
 def model_plans(plan: Plan) -> dict[str, Plan]:
     """Return a plan on every model that can step its worlds, its own model first."""
-    plans = {REQUESTED: plan}
+    plans, period = {REQUESTED: plan}, plan.setting.physics.control_period
     for name, physics in MODELS.items():
         engine = ENGINES.get(name, plan.setting.engine)
         with contextlib.suppress(InputError):  # the engine lacks such worlds, laws or physics
+            physics = replace(physics, control_period=period)
             setting = replace(plan.setting, physics=physics, engine=engine)
             model_plan = replace(plan, setting=setting)
             model_plan.check_here()

@@ -180,7 +180,7 @@ class Sweep(SweepOptions, PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQues
 
     def check(self) -> None:
         sharded = self.parsed_shard.count > 1
-        if self.points is not None and self.worlds is not None:
+        if self.points is not None and self.worlds is not None and not self.quick:
             raise InputError("worlds is not allowed with points: there is one world at each point.")
         if self.models and (self.ray or sharded):
             raise InputError("models is not allowed with ray or a shard: run it in one process.")

@@ -33,6 +33,7 @@ from rps_jax.analysis.figures.style import (
     words,
 )
 from rps_jax.engines import device
+from rps_jax.physics import preset
 from rps_jax.questions import LawQuestion, Picture, Plan, Run, Section, call_of, option
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
@@ -41,7 +42,7 @@ from rps_jax.runs import execution
 from rps_jax.runs.question import DomainQuestion, count_true
 from rps_jax.studies.probe import Probe
 from rps_jax.trials.progress import Bar, set_phase
-from rps_jax.trials.setting import seed_of
+from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.world import points
 
 # [1] shares of the time after which the search ends, and the check of elites.
@@ -127,6 +128,13 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         self._store_worst(results, run)
         return results
 
+    @property
+    def reference(self) -> Setting:
+        """Setting of converged C MuJoCo, with the support and the control period of the search."""
+        same = {name: getattr(self.setting.physics, name) for name in ("control_period", "support")}
+        physics = replace(preset(fidelity="reference"), **same)
+        return replace(self.setting, engine="mujoco", physics=physics)
+
     def _check_elites(self, results: xr.Dataset, run: Run, deadline: float) -> xr.Dataset:
         """Try elites again in converged C MuJoCo, evenly from the worst to the least severe."""
         count = results.sizes["elite"]
@@ -135,10 +143,9 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         # In a random order, so that those before the deadline are even, too.
         order = np.random.default_rng(0).permutation(even)
         set_phase(run.callback, "check in C MuJoCo")
-        setting = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
         # A search that continues for longer has other elites.
         name = f"check-{files.sha256(results.u.values.tobytes())[:8]}"
-        probe = Probe(self.ranges, self.params, setting, run.inside(name))
+        probe = Probe(self.ranges, self.params, self.reference, run.inside(name))
         batch = max(1, run.workers or device.count_processors())
         for first in range(0, len(order), batch):
             if time.perf_counter() >= deadline:

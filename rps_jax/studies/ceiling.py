@@ -123,6 +123,8 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         if self.run is not None:
             load_plan(Path(self.run))  # refuses other runs than sweeps
             self.refuse_options(("domain", "robot", "task"))
+        elif self.lost_by:
+            raise errors.not_allowed("lost_by", self.lost_by, "only a run has laws; give RUN")
         if not self.world_indices.size:
             raise errors.not_allowed("sample", self.sample, "no world would be tried")
         replace(self, domain=self.plan.domain, setting=self.plan.setting, run=None).check_engine()

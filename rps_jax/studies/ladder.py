@@ -5,6 +5,7 @@ The order of the senses is `touch` (where the skin is touched), `taxels` (each t
 seed is one that no tuner uses.
 """
 
+import contextlib
 import dataclasses
 import re
 import textwrap
@@ -204,8 +205,11 @@ class Score(Ladder, _ScoredLaw):
     def chosen(self) -> dict[str, LawParams]:
         label, params = resolve_law(self.law)
         scored = {label: registry.check_params(params)}
-        others = self.laws or suited_laws(*self._robot_and_task, ("rps", "rps_plus"))
-        return scored | registry.resolve_laws(others) | scored
+        others, where = self.laws, self._robot_and_task
+        if isinstance(others, tuple) and not others:
+            with contextlib.suppress(InputError):  # no law of the package suits robot and task
+                others = suited_laws(*where, ("rps", "rps_plus"))
+        return scored | (registry.resolve_laws(others) if others else {}) | scored
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
         sections = super().sections(sweep, results, run)

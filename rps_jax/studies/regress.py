@@ -11,7 +11,7 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import xarray as xr
@@ -52,6 +52,7 @@ class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
     """
 
     TITLE = "Hard worlds"
+    QUICK: ClassVar = {"worlds": 20}
 
     laws: LawsLike = ("rps_tuned",)
     worlds: int | None = option(None, 1, 200)

@@ -125,7 +125,7 @@ class Case(TrialOptions):
     @cached_property
     def sensor(self) -> Skin:
         """The skin on the robot."""
-        return skins.parse_skin(self.skin or "ideal")._replace(shell=self.base.shell)
+        return skins.mounted(self.skin or "ideal", self.base)
 
     @property
     def title(self) -> str:
@@ -149,8 +149,8 @@ def suited_laws(
         return tuple(x for x in laws if x in known) or (unicycle.PRESET_OF[robot.drive],)
     if (name := pose.preset_of(robot)) is None:
         base = f"drive = {robot.drive}" if robot.radius is None else "a round base"
-        rule = f"no law for {base} brings objects to a heading; name one by law"
-        raise errors.not_allowed("law", "None", rule)
+        rule = f"no law for {base} brings objects to a heading; name a custom law, or another robot"
+        raise errors.not_allowed("task", task, rule)
     return (name if task.HAS_TARGET else f"path_{name}",)
 
 
@@ -161,7 +161,7 @@ def friction_of(friction: FrictionLike) -> Friction:
       InputError: the text is not valid.
     """
     if isinstance(friction, str) and "," not in friction:
-        return FRICTION[errors.check_name("friction set", friction, FRICTION)]
+        return FRICTION[errors.check_name("friction set", friction, FRICTION, "GROUND,ROBOT")]
     values = friction.split(",") if isinstance(friction, str) else friction
     if not isinstance(values, tuple | list) or len(values) != 2:
         raise errors.not_allowed("friction", repr(friction), "write S1, S2 or ground,robot")

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from rps_jax import errors
 from rps_jax.geometry.arrays import Array
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
@@ -192,6 +193,18 @@ class TuneES(Descent):
     learning_rate: float = option(0.2, above=0)
     """Root mean square change of the parameters in the first step of antithetic, in units of the
     bounded map [1]; it decays to zero along a cosine."""
+
+    def quick_values(self) -> Mapping[str, object]:
+        values = super().quick_values()
+        return {k: x for k, x in values.items() if k not in self.UNUSED[self.estimator]}
+
+    def check(self) -> None:
+        super().check()
+        for name in self.UNUSED[self.estimator]:
+            value = getattr(self, name)
+            if value != getattr(type(self), name) and name != "estimator":
+                known = " or ".join(x for x, unused in self.UNUSED.items() if name not in unused)
+                raise errors.not_allowed(name, value, f"only the estimator {known} has it")
 
     @property
     def num_generations(self) -> int:

@@ -30,7 +30,8 @@ from rps_jax.analysis.report import Section
 from rps_jax.engines import finger
 from rps_jax.geometry import planar, polyline, solid
 from rps_jax.geometry.arrays import Array, Pair
-from rps_jax.record import table
+from rps_jax.record import files, table
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs.question import Question, Rows, Run, call_of
 
@@ -117,8 +118,11 @@ def read_pushes(pushes: PushesLike) -> Pushes:
     table.require(pushes, name, _COLUMNS)
     numbers = pushes[list(_COLUMNS)].apply(pd.to_numeric, errors="coerce")
     rows = numbers.to_numpy(float)
-    if not len(rows) or not np.isfinite(rows).all():
-        raise errors.not_allowed("pushes", "a table with gaps", "give finite numbers, m and rad")
+    if not len(rows):
+        raise errors.InputError(f"{name} is empty: give a row for each time of each push.")
+    for i, k in np.argwhere(~np.isfinite(rows))[:1].tolist():
+        fault = f"without a number for {[*_COLUMNS][k]} in row {numbers.index[i]}"
+        raise errors.not_allowed("pushes", fault, "give finite numbers, m and rad")
     largest = numbers[[name for name, unit in _COLUMNS.items() if unit == "m"]].abs().max()
     if largest.max() > 50:
         rule = "it is at most 50 m: give x and y in m and yaw in rad"
@@ -339,8 +343,10 @@ def _check(corners: np.ndarray, data: Pushes, radius: float, prior: Mapping) -> 
     """Raise InputError for inputs of a fit that make no sense, before anything is compiled."""
     errors.check_finite("radius", radius, at_least=1e-4, at_most=0.5, unit="m")
     count = len(data.path)
-    if (unknown := set(prior) - set(PRIOR)) or any(sd <= 0 for _, sd in prior.values()):
-        errors.check_name("parameter of the prior", min(unknown, default=""), PRIOR)
+    for name, pair in prior.items():
+        errors.check_name("parameter of the prior", name, PRIOR)
+        _, deviation = errors.check_array(f"prior {name}", pair, (2,))
+        errors.check_finite(f"prior {name} deviation", deviation, above=0)
     if not 3 <= count <= _MAX_PUSHES:
         raise errors.not_allowed("pushes", count, f"give 3 to {_MAX_PUSHES}, better 5 or more")
     gaps = data.gaps(corners, radius)
@@ -417,6 +423,7 @@ class FitObject(Question[ObjectFit]):
     """
 
     TITLE = "An object fitted to pushes"
+    IGNORED_FIELDS = ("outline", "pushes")  # their values matter
 
     outline: str | Any = option("", positional=True)
     """Corners x, y [m] of a simple polygon in the object's frame: an array, or a table FILE.csv
@@ -429,7 +436,7 @@ class FitObject(Question[ObjectFit]):
     feet: Any = option(None, kw_only=True, hidden=True)
     """Known feet x, y [m] (S, 2) of the object, in Python; by default it has pressure under all of
     its outline."""
-    prior: Any = option(None, kw_only=True, hidden=True)
+    prior: Mapping[str, Any] | None = option(None, kw_only=True, hidden=True)
     """Priors (mean, standard deviation) of parameters by name, in Python; by default `PRIOR`."""
 
     @functools.cached_property
@@ -446,6 +453,12 @@ class FitObject(Question[ObjectFit]):
     def check(self) -> None:
         super().check()
         _check(*self._inputs, self.radius, self.prior or PRIOR)
+
+    def fields_as_json(self) -> JsonObject:
+        """Fields as JSON; outline and pushes by the digest of their values."""
+        corners, data = self._inputs
+        contents = b"".join(np.asarray(x, float).tobytes() for x in (corners, *data))
+        return super().fields_as_json() | {"inputs": files.sha256(contents)}
 
     def answer(self, run: Run) -> ObjectFit:
         """Fit the object to the pushes."""

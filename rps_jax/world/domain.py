@@ -508,7 +508,7 @@ def parse_domain(
     if isinstance(domain, Domain):
         return domain
     if not isinstance(domain, str):
-        raise errors.not_allowed("domain", domain, "give a name or a Domain")
+        raise errors.not_allowed("domain", repr(domain), "give a text, as wide, or a Domain")
     head, changes = parse_changes("domain", domain)
     if files.suffix_of(head) == ".json":
         base = from_json(files.read_json(Path(head)))

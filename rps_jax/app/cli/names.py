@@ -79,9 +79,12 @@ def extensions(words: list[str]) -> tuple[list[Path], list[str]]:
     """
     files = list(itertools.takewhile(lambda word: word.endswith(".py"), words))
     rest = words[len(files) :]
-    if not rest or rest[0] not in {name.split()[0] for name in known()}:
-        return [], words  # the first file is a question
-    return [*map(Path, files)], rest
+    commands = dict.fromkeys(name.split()[0] for name in known())
+    if rest and rest[0] in commands:
+        return [*map(Path, files)], rest
+    if files and rest and rest[0][0] != "-" and not _definitions(Path(files[-1])):
+        check_name("command", rest[0], commands)
+    return [], words  # the first file is a question
 
 
 def split(words: list[str]) -> tuple[str, list[str]]:
@@ -99,20 +102,24 @@ def split(words: list[str]) -> tuple[str, list[str]]:
 
 def question_type(name: str) -> "type[Question[object]]":
     """Return the class of a command, by its name or its path."""
-    from rps_jax.record import files
-
     if name in known():
         return getattr(importlib.import_module(known()[name].module), known()[name].class_name)
     path = Path(name)
     path = path / "study.py" if path.is_dir() else path
-    text = files.read_regular(path, "python").decode(errors="replace")
-    definitions = _DEFINITION.findall(text)
+    definitions = _definitions(path)
     if len(definitions) != 1:
         raise InputError(
             f"study = {path} defines {len(definitions)} commands: write `name = call_of(Class)` "
             "once."
         )
     return getattr(import_file(path), definitions[0][1])
+
+
+def _definitions(path: Path) -> list[tuple[str, str]]:
+    """Return the names and classes of the commands that a file defines."""
+    from rps_jax.record import files
+
+    return _DEFINITION.findall(files.read_regular(path, "python").decode(errors="replace"))
 
 
 def import_file(path: Path) -> ModuleType:

@@ -110,7 +110,7 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
     params = registry.check_params(params)
     functions, base = registry.law_of(params), robots.parse_robot(robot)
     registry.check_drive(params, base.drive)
-    sensor = skins.parse_skin(skin)._replace(shell=base.shell)
+    sensor = skins.mounted(skin, base)
     if not isinstance(sensor, CapacitiveSkin) or not sensor.shell.count:
         rule = "name one with taxels, as capacitive, on a robot with boards"
         raise not_allowed("skin", skin, rule)
