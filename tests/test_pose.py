@@ -348,7 +348,10 @@ def last_twist(*inputs):
     return pushed(*inputs)[1]
 
 
-def even_push(law, K_y, y, x=0.3625, truth=~NO):
+HARD, SMOOTH = (jax.jit(x.step) for x in (LAW, registry.smooth_law(LAW)))
+
+
+def even_push(step, K_y, y, x=0.3625, truth=~NO):
     """Return parameters, the state after 29 steps with a face off the line by y, the observation.
 
     The contact is at x [m] ahead.
@@ -356,23 +359,25 @@ def even_push(law, K_y, y, x=0.3625, truth=~NO):
     params = PoseParams(K_y=K_y)
     ends = jnp.array([0.15, -0.15]), jnp.ones(2, bool), ~NO, jnp.asarray(0.3625)
     obs = sensed(touching(x, 0.0, [2.0, y], truth), *ends)
-    state = jax.lax.fori_loop(0, 29, lambda _, s: law.step(params, s, obs)[0], law.init(params))
+    state = LAW.init(params)
+    for _ in range(29):
+        state, *_ = step(params, state, obs)
     return params, state, obs
 
 
-def pushed(law, weight, *inputs):
+def pushed(step, weight, *inputs):
     """Return state and twist (3,) after a step more of `even_push`; its contact has a weight."""
-    params, state, obs = even_push(law, *inputs, truth=jnp.ones((), weight.dtype))
+    params, state, obs = even_push(step, *inputs, truth=jnp.ones((), weight.dtype))
     obs = obs._replace(touch=obs.touch._replace(in_contact=weight))
-    state, twist, _ = law.step(params, state, obs)
+    state, twist, _ = step(params, state, obs)
     return state, jnp.stack(twist)
 
 
 def test_a_flush_face_turns_about_a_point_beside_the_middle_of_the_box():
-    params, push = PoseParams(), jax.jit(lambda y: last_twist(LAW, ~NO, 0.0, y))
+    params = PoseParams()
     sharpest = params.turn * 0.15 / (0.15**2 + params.r**2)
     for y in (0.004, 0.02, -0.02, 0.2):
-        v_x, v_y, omega = map(float, push(jnp.asarray(y)))
+        v_x, v_y, omega = map(float, last_twist(HARD, ~NO, 0.0, jnp.asarray(y)))
         assert_allclose(v_y + omega * (0.3625 + params.r), 0, atol=1e-6)
         assert np.sign(omega) == np.sign(y)
         assert abs(omega / v_x) < sharpest + 1e-5
@@ -444,33 +449,31 @@ def test_a_side_reaches_as_far_as_it_was_felt_until_its_end_is_seen():
 
 def test_an_uneven_contact_forgets_the_sides_and_if_it_is_narrow_the_size_of_the_box():
     """Afterwards the side of the base alone feels the object, which is then sought there."""
-    step = jax.jit(LAW.step)
     for end, half in ((0.27, 0.27), (0.1, 0.2346)):
-        params, state, obs = even_push(LAW, 0.2, 0.0)
+        params, state, obs = even_push(HARD, 0.2, 0.0)
         uneven = obs._replace(even=NO, ends=jnp.array([end, -end]))
         for _ in range(90):
-            state, _, _ = step(params, state, uneven)
+            state, _, _ = HARD(params, state, uneven)
         assert not state.known.any()
         assert_allclose(state.h[1::2], half, atol=1e-6)
     beside = uneven._replace(touch=touching(0.34, 0.29, [2.0, 0.0]))
-    state, _, _ = step(params, state, beside)
+    state, _, _ = HARD(params, state, beside)
     assert state.h[1] - state.h[3] > 0.6
 
 
 def test_a_contact_around_both_corners_of_the_front_is_a_push():
-    state, _ = jax.jit(lambda x: pushed(LAW, ~NO, 0.2, 0.01, x))(0.3399)
+    state, _ = pushed(HARD, ~NO, 0.2, 0.01, 0.3399)
     assert int(state.mode) == 0
 
 
 def test_the_smooth_law_mixes_its_pushes_by_the_weight_of_the_contact():
-    smooth = registry.smooth_law(LAW)
     inputs = 0.2, jnp.asarray(0.01)
-    expected = jax.jit(last_twist, static_argnums=0)(LAW, ~NO, *inputs)
+    expected = last_twist(HARD, ~NO, *inputs)
     assert expected[0] > 0
     slide = expected[1] + expected[2] * (0.3625 + PoseParams().r)
     assert_allclose(slide, 0.2 * 0.01, rtol=0.2)
-    twist = lambda w, K: [last_twist(smooth, w, K, inputs[1])] * 2  # noqa: E731
-    weigh = jitted(lambda w: jax.jacfwd(twist, (0, 1), has_aux=True)(w, 0.2))
+    twist = lambda w, K: [last_twist(SMOOTH, w, K, inputs[1])] * 2  # noqa: E731
+    weigh = lambda w: jax.jacfwd(twist, (0, 1), has_aux=True)(jnp.asarray(w), 0.2)  # noqa: E731
     assert_allclose(weigh(1.0)[1], expected, atol=1e-7)
     (by_weight, by_gain), _ = weigh(0.9)
     numeric = (weigh(0.91)[1] - weigh(0.89)[1]) / 0.02
