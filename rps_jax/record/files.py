@@ -109,7 +109,7 @@ def write_json(path: Path, content: object, *, checked: bool = False) -> Path:
     return write_bytes(path, text.encode(), checked=checked)
 
 
-def plain(number: Any) -> object:
+def plain(number: object) -> object:
     """Return a number or an array of NumPy or JAX as JSON has it, for `json.dumps`."""
     return np.asarray(number).tolist()
 

@@ -392,7 +392,7 @@ def parse_skin(skin: SkinLike) -> Any:
     return changed
 
 
-def mounted(skin: SkinLike, robot: Robot) -> Any:
+def mounted(skin: SkinLike, robot: Robot) -> Skin:
     """Return a skin on the boards of a robot, whose time constant replaces that of the skin."""
     sensor = parse_skin(skin)._replace(shell=robot.shell)
     if robot.time_constant is None or "time_constant" not in sensor._fields:

@@ -20,7 +20,7 @@ import pandas as pd
 import xarray as xr
 from scipy import stats
 
-from rps_jax import InputError, errors, load
+from rps_jax import InputError, Setting, errors, load
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import (
     WIDTH,
@@ -42,7 +42,7 @@ from rps_jax.runs import execution
 from rps_jax.runs.question import DomainQuestion, count_true
 from rps_jax.studies.probe import Probe
 from rps_jax.trials.progress import Bar, set_phase
-from rps_jax.trials.setting import Setting, seed_of
+from rps_jax.trials.setting import seed_of
 from rps_jax.world import points
 
 # [1] shares of the time after which the search ends, and the check of elites.
