@@ -200,7 +200,7 @@ def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_
         rps_jax.fit_object(SQUARE, table, RADIUS, feet=SQUARE[:2])
     with refusing("prior size deviation = 0.0 is not allowed: .* above 0"):
         rps_jax.fit_object(SQUARE, table, RADIUS, prior={"size": (0.0, 0.0)})
-    with refusing("without a number for yaw in row 2 is"):
+    with refusing("pushes .push, time, .* = nan at index .2, 4. is not allowed"):
         rps_jax.fit_object(SQUARE, table.assign(yaw=table.yaw.drop(2)), RADIUS)
     table.assign(tip_x=table.tip_x + 1e-6).to_csv(paths[1], index=False)
     with refusing("holds another run .inputs"):  # of the same paths

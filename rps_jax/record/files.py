@@ -12,6 +12,7 @@ import contextlib
 import hashlib
 import io
 import json
+import operator
 import os
 import stat
 import zipfile
@@ -43,6 +44,7 @@ _KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a desc
 POINTER = b"version https://"  # first bytes of a pointer of Git LFS
 FETCH = "it is a pointer of Git LFS: fetch the file itself by `git lfs pull`"
 FIELD_FILES = (".json", ".yaml", ".yml")  # suffixes of files with names and values
+plain = operator.methodcaller("tolist")  # of numbers of NumPy and JAX, for `json.dumps`
 _SAMPLE = 4096  # values of a column of results
 _COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 Arrays = dict[str, np.ndarray]  # by name
@@ -107,11 +109,6 @@ def write_json(path: Path, content: object, *, checked: bool = False) -> Path:
     """Write readable JSON in the order of its keys, with its checksum if `checked`."""
     text = json.dumps(content, indent=2, default=plain) + "\n"
     return write_bytes(path, text.encode(), checked=checked)
-
-
-def plain(number: object) -> object:
-    """Return a number or an array of NumPy or JAX as JSON has it, for `json.dumps`."""
-    return np.asarray(number).tolist()
 
 
 def write_results(path: Path, results: xr.Dataset) -> Path:

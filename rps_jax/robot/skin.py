@@ -395,9 +395,8 @@ def parse_skin(skin: SkinLike) -> Any:
 def mounted(skin: SkinLike, robot: Robot) -> Skin:
     """Return a skin on the boards of a robot, whose time constant replaces that of the skin."""
     sensor = parse_skin(skin)._replace(shell=robot.shell)
-    if robot.time_constant is None or "time_constant" not in sensor._fields:
-        return sensor
-    return sensor._replace(time_constant=robot.time_constant)
+    known = robot.time_constant is not None and isinstance(sensor, CapacitiveSkin)
+    return sensor._replace(time_constant=robot.time_constant) if known else sensor
 
 
 def _first(excess: Array) -> Array:

@@ -131,8 +131,8 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     @property
     def reference(self) -> Setting:
         """Setting of converged C MuJoCo, with the support and the control period of the search."""
-        same = {name: getattr(self.setting.physics, name) for name in ("control_period", "support")}
-        physics = replace(preset(fidelity="reference"), **same)
+        period, support = self.setting.physics.control_period, self.setting.physics.support
+        physics = replace(preset(fidelity="reference"), control_period=period, support=support)
         return replace(self.setting, engine="mujoco", physics=physics)
 
     def _check_elites(self, results: xr.Dataset, run: Run, deadline: float) -> xr.Dataset:

@@ -206,9 +206,8 @@ class Score(Ladder, _ScoredLaw):
         label, params = resolve_law(self.law)
         scored = {label: registry.check_params(params)}
         others, where = self.laws, self._robot_and_task
-        if isinstance(others, tuple) and not others:
-            with contextlib.suppress(InputError):  # no law of the package suits robot and task
-                others = suited_laws(*where, ("rps", "rps_plus"))
+        with contextlib.suppress(InputError):  # no law of the package suits robot and task
+            others = others or suited_laws(*where, ("rps", "rps_plus"))
         return scored | (registry.resolve_laws(others) if others else {}) | scored
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -194,15 +194,11 @@ class TuneES(Descent):
     """Root mean square change of the parameters in the first step of antithetic, in units of the
     bounded map [1]; it decays to zero along a cosine."""
 
-    def quick_values(self) -> Mapping[str, object]:
-        values = super().quick_values()
-        return {k: x for k, x in values.items() if k not in self.UNUSED[self.estimator]}
-
     def check(self) -> None:
         super().check()
         for name in self.UNUSED[self.estimator]:
-            value = getattr(self, name)
-            if value != getattr(type(self), name) and name != "estimator":
+            value, usual = getattr(self, name), (getattr(TuneES, name), self.QUICK.get(name))
+            if value not in usual and name != "estimator":
                 known = " or ".join(x for x, unused in self.UNUSED.items() if name not in unused)
                 raise errors.not_allowed(name, value, f"only the estimator {known} has it")
 

@@ -117,12 +117,8 @@ def read_pushes(pushes: PushesLike) -> Pushes:
         pushes = table.read(Path(pushes), name, _COLUMNS.get)
     table.require(pushes, name, _COLUMNS)
     numbers = pushes[list(_COLUMNS)].apply(pd.to_numeric, errors="coerce")
-    rows = numbers.to_numpy(float)
-    if not len(rows):
-        raise errors.InputError(f"{name} is empty: give a row for each time of each push.")
-    for i, k in np.argwhere(~np.isfinite(rows))[:1].tolist():
-        fault = f"without a number for {[*_COLUMNS][k]} in row {numbers.index[i]}"
-        raise errors.not_allowed("pushes", fault, "give finite numbers, m and rad")
+    columns = f"pushes ({', '.join(_COLUMNS)})"
+    rows = errors.check_array(columns, numbers, ("n", len(_COLUMNS)))
     largest = numbers[[name for name, unit in _COLUMNS.items() if unit == "m"]].abs().max()
     if largest.max() > 50:
         rule = "it is at most 50 m: give x and y in m and yaw in rad"

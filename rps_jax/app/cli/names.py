@@ -82,7 +82,7 @@ def extensions(words: list[str]) -> tuple[list[Path], list[str]]:
     commands = dict.fromkeys(name.split()[0] for name in known())
     if rest and rest[0] in commands:
         return [*map(Path, files)], rest
-    if files and rest and rest[0][0] != "-" and not _definitions(Path(files[-1])):
+    if files and rest and not rest[0].startswith("-") and not _definitions(Path(files[-1])):
         check_name("command", rest[0], commands)
     return [], words  # the first file is a question
 
