@@ -98,8 +98,9 @@ def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
     @functools.wraps(command, assigned=("__module__", "__doc__"), updated=())
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         current: Any = current_names(command, kwargs)
-        for name in current:
-            _check_argument(name, inspect.signature(command).parameters, call.__name__)
+        known = inspect.signature(command).parameters
+        for name in current.keys() - known.keys():
+            _check_argument(name, known, call.__name__)
         return command(*args, **current)()  # pyright: ignore[reportCallIssue]
 
     call.__name__ = call.__qualname__ = snake_case(command.__name__)
@@ -132,10 +133,10 @@ def _document(command: Any, text: str) -> str:
 
 def _check_argument(name: str, known: Collection[str], function: str) -> None:
     """Raise InputError for an unknown argument of a command's function, with what to write."""
-    places = {x.name: f"Setting({x.name}=...)" for x in fields(Setting)}
-    places |= {x: f"Setting(rules=Rules({x}=...))" for x in Rules._fields}
-    if name in places and name not in known and "setting" in known:
-        text = f"{name} of {function} belongs to its setting: write setting={places[name]}."
+    settings = {x.name: f"Setting({x.name}=...)" for x in fields(Setting)}
+    settings |= {x: f"Setting(rules=Rules({x}=...))" for x in Rules._fields}
+    if name in settings and "setting" in known:
+        text = f"{name} of {function} belongs to its setting: write setting={settings[name]}."
         raise errors.InputError(text)
     errors.check_name(f"argument of {function}", name, known)
 
