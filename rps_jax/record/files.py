@@ -44,7 +44,6 @@ _KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a desc
 POINTER = b"version https://"  # first bytes of a pointer of Git LFS
 FETCH = "it is a pointer of Git LFS: fetch the file itself by `git lfs pull`"
 FIELD_FILES = (".json", ".yaml", ".yml")  # suffixes of files with names and values
-plain = operator.methodcaller("tolist")  # of numbers of NumPy and JAX, for `json.dumps`
 _SAMPLE = 4096  # values of a column of results
 _COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 Arrays = dict[str, np.ndarray]  # by name
@@ -107,8 +106,12 @@ def write_csv(path: Path, table: pd.DataFrame) -> Path:
 
 def write_json(path: Path, content: object, *, checked: bool = False) -> Path:
     """Write readable JSON in the order of its keys, with its checksum if `checked`."""
-    text = json.dumps(content, indent=2, default=plain) + "\n"
-    return write_bytes(path, text.encode(), checked=checked)
+    return write_bytes(path, (json_text(content, 2) + "\n").encode(), checked=checked)
+
+
+def json_text(content: object, indent: int | None = None) -> str:
+    """Return content as JSON, with numbers of NumPy and JAX."""
+    return json.dumps(content, indent=indent, default=operator.methodcaller("tolist"))
 
 
 def write_results(path: Path, results: xr.Dataset) -> Path:

@@ -51,7 +51,7 @@ def ensure_writable(folder: Path) -> Path:
 def claim(folder: Path, configuration: JsonObject) -> Path:
     """Write the configuration of a run to its folder; InputError if it holds another run."""
     ensure_writable(folder)
-    new = json.loads(json.dumps(configuration, default=files.plain))
+    new = json.loads(files.json_text(configuration))
     with lock_briefly(folder):
         if not (folder / MANIFEST).exists():
             _copy_sources(folder, configuration)
@@ -69,7 +69,7 @@ def difference(folder: Path, configuration: JsonObject) -> str:
     if not (folder / MANIFEST).exists():
         return ""
     stored = files.read_checked_json(folder / MANIFEST)
-    return describe_difference(stored, json.loads(json.dumps(configuration, default=files.plain)))
+    return describe_difference(stored, json.loads(files.json_text(configuration)))
 
 
 def sources(folder: Path, digest: str) -> Path:

@@ -189,7 +189,7 @@ def load_plan(folder: Path) -> Plan:
     if "points" in record:
         plan = dataclasses.replace(plan, points=Points.read(folder, str(record["points"])))
     # Options that an older version did not store would otherwise get the defaults of this version.
-    current = json.loads(json.dumps(plan.configuration(), default=files.plain))
+    current = json.loads(files.json_text(plan.configuration()))
     if words := run_folder.describe_difference(record, current):
         raise InputError(
             f"run = {folder} was written by another version ({words}), "

@@ -285,7 +285,7 @@ def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
     coords |= {"quantity": quantities, "world": np.arange(len(u))}
     words = {"units": "1", "long_name": "point of the unit cube"}
     data = {"u": (("world", "quantity"), u, words)}
-    return xr.Dataset(data, coords, {"domain": json.dumps(to_json(domain), default=files.plain)})
+    return xr.Dataset(data, coords, {"domain": files.json_text(to_json(domain))})
 
 
 def _is_json_of(text: str, domain: Domain) -> bool:
