@@ -26,6 +26,14 @@ class InputError(ValueError):
         super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in short))
 
 
+class UnknownNameError(InputError):
+    """An unknown name of a kind of things, some of which users can register."""
+
+    def __init__(self, kind: str, name: str, allowed: str) -> None:
+        super().__init__(f"unknown {kind} '{name}': choose from {allowed}.")
+        self.kind, self.name = kind, name
+
+
 _MAX_WORD = 200  # characters; most paths are shorter
 _LONG_WORD = re.compile(rf"(\S{{60}})\S{{{_MAX_WORD - 60},}}?([^\w\s]{{0,3}})(?!\S)")
 
@@ -139,7 +147,7 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int) ->
 
 
 def check_name(kind: str, name: str, known: Iterable[str], file: str = "") -> str:
-    """Return a name if it is known, or raise an InputError with the known and the nearest names.
+    """Return a name if it is known, or raise an UnknownNameError with the known and nearest names.
 
     The error also names a `file` that is allowed instead, as FILE.json.
     """
@@ -147,7 +155,7 @@ def check_name(kind: str, name: str, known: Iterable[str], file: str = "") -> st
     if name in known:
         return name
     hint, alternative = suggest(name, known), f", or give {file}" if file else ""
-    raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{alternative}{hint}.")
+    raise UnknownNameError(kind, name, f"{', '.join(known)}{alternative}{hint}")
 
 
 def suggest(name: object, known: Sequence[str]) -> str:

@@ -63,11 +63,14 @@ def check_process() -> None:
 
 
 def check_eager(name: str, inputs: object) -> None:
-    """Raise InputError for traced inputs of a function, or within `jax.jit`."""
+    """Raise InputError for traced inputs of a function, or within `jit`, `vmap` or `grad`."""
     import jax
+    from jax.extend.core import find_top_trace
 
-    leaves = jax.tree.leaves((inputs, jax.device_put(0.0)))
-    if any(isinstance(x, jax.core.Tracer) for x in leaves):
+    trace = find_top_trace(())  # which starts no device
+    with jax.core.eval_context():
+        is_traced = trace is not find_top_trace(())
+    if is_traced or any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(inputs)):
         raise InputError(
             f"{name} returns numbers of the host: call it outside of jit, vmap and grad, or "
             "transform a function that calls rps_jax.rollout."

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
-from rps_jax.errors import InputError
+from rps_jax.errors import InputError, UnknownNameError
 from rps_jax.record import files, manifest, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.files import JsonObject
@@ -38,6 +38,7 @@ from rps_jax.world.draws import Draw
 from rps_jax.world.points import Points
 from rps_jax.world.scene import Scene
 
+_REGISTERED = {"engine", "task", "domain object", "domain quantity"}  # kinds of names
 _SETTING = Stored(
     lambda name, setting: setting.to_json(),
     lambda name, entries, folder: Setting.from_json(entries),
@@ -181,10 +182,11 @@ def load_plan(folder: Path) -> Plan:
     try:
         plan = Plan(**manifest.fields_from_json(Plan, record, folder))
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
-        text = str(error.__cause__ or error)
-        if name := re.match("unknown (engine|domain (quantity|object)|task) '[^']*'", text):
+        unknown = error.__cause__ or error
+        if isinstance(unknown, UnknownNameError) and unknown.kind in _REGISTERED:
             rule = "give the file that registers it before the command, as rps FILE.py replay RUN"
-            raise InputError(f"run = {folder} has an {name[0]}: {rule}.") from error
+            text = f"unknown {unknown.kind} '{unknown.name}'"
+            raise InputError(f"run = {folder} has an {text}: {rule}.") from error
         raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
     if "points" in record:
         plan = dataclasses.replace(plan, points=Points.read(folder, str(record["points"])))
