@@ -30,6 +30,7 @@ from rps_jax.tuning import derivatives
 from rps_jax.tuning.space import Space
 from rps_jax.world import draws
 from rps_jax.world.domain import PERFECT, QUANTITIES, VELOCITY_ERRORS, Range, parse_domain
+from rps_jax.world.tasks import parse_task
 
 README = (ROOT / "rps_jax" / "README.md").read_text().partition("### Gradients\n")[2]
 QUASISTATIC = Setting("quasistatic")
@@ -253,6 +254,18 @@ test_invalid_rollouts_are_refused = refusals(
     (ROUTE | {"world": BATCH}, "world = a WorldBatch is not allowed: give a World"),
     (ROUTE | {"setting": Setting("mujoco")}, "engine = mujoco is not allowed"),
     (ROUTE | {"setting": Setting()}, "engine = fused .* worlds were drawn for quasistatic"),
+    (
+        ROUTE | {"setting": Setting("quasistatic", "default,support=even")},
+        "support = even is not allowed: the worlds were drawn with corners",
+    ),
+    (
+        ROUTE
+        | {
+            "params": LAWS["pose"],
+            "stage": replace(BATCH.stage, task=parse_task("path")),
+        },
+        "task = path with the law pose is not allowed",
+    ),
     (ROUTE | {"params": 3.0}, "params = 3.0"),
     (
         ROUTE | {"params": RPSParams(K_h=np.ones(4))},
