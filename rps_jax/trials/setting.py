@@ -80,6 +80,7 @@ class Setting:
 
     def __post_init__(self) -> None:
         options.check_fields(self)
+        object.__setattr__(self, "seed", int(self.seed))  # those of NumPy overflow
         self.rules.check()
         if self.physics.cone != "elliptic":  # all engines have this one: import no engine
             self.simulator.check_physics(self.physics)
