@@ -30,7 +30,6 @@ from rps_jax.tuning import derivatives
 from rps_jax.tuning.space import Space
 from rps_jax.world import draws
 from rps_jax.world.domain import PERFECT, QUANTITIES, VELOCITY_ERRORS, Range, parse_domain
-from rps_jax.world.tasks import parse_task
 
 README = (ROOT / "rps_jax" / "README.md").read_text().partition("### Gradients\n")[2]
 QUASISTATIC = Setting("quasistatic")
@@ -262,7 +261,9 @@ test_invalid_rollouts_are_refused = refusals(
         ROUTE
         | {
             "params": LAWS["pose"],
-            "stage": replace(BATCH.stage, task=parse_task("path")),
+            "world": row(
+                trajectory.draw_worlds(TOUCHING, task="path", setting=QUASISTATIC).worlds, 0
+            ),
         },
         "task = path with the law pose is not allowed",
     ),

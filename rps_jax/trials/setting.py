@@ -147,8 +147,6 @@ class Setting:
     @classmethod
     def from_json(cls, record: JsonObject) -> Setting:
         """Return the setting of a record with the fields of `to_json`."""
-        fields = dict(record["physics"]).items()
-        values: JsonObject = {k: tuple(x) if isinstance(x, list) else x for k, x in fields}
-        physics, rules = Physics(**values), Rules(**record["rules"])
+        physics, rules = Physics(**record["physics"]), Rules(**record["rules"])
         seed, split = record["seed"], record.get("split")
         return cls(record["engine"], physics, rules=rules, seed=seed, split=split)

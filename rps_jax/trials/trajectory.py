@@ -9,8 +9,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +17,7 @@ from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams, freeze_functions, named_leaves
 from rps_jax.engines import device, native
-from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
+from rps_jax.engines.base import Stage
 from rps_jax.geometry.arrays import Pytree
 from rps_jax.record.options import check_arguments
 from rps_jax.robot.robot import RobotLike
@@ -29,27 +27,7 @@ from rps_jax.trials.trial import ControlLoop, Trial, World
 from rps_jax.trials.worlds import WorldBatch, drawn_worlds, rows, soften_skins
 from rps_jax.world import draws
 from rps_jax.world.domain import DomainLike, parse_domain
-from rps_jax.world.physics import Physics
-from rps_jax.world.tasks import Task, TaskLike
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class DrawnStage:
-    """Stage of drawn worlds, with the physics and the task that they were drawn with."""
-
-    stage: Stage
-    physics: Physics = field(metadata={"static": True})
-    task: Task = field(metadata={"static": True})
-
-    @property
-    def native(self) -> bool:
-        """Whether `engines.native` can compile the step of one world."""
-        return self.stage.native
-
-    def drive(self, fields: Pytree, motion: Motion, period: ControlPeriod) -> Driven:
-        """Step a batch of worlds for one control period: see `Stage.drive`."""
-        return self.stage.drive(fields, motion, period)
+from rps_jax.world.tasks import TaskLike
 
 
 @device.standard_jax()
@@ -94,7 +72,8 @@ def draw_worlds(
     setting.check_domain(ranges)
     drawn = draws.draw(ranges, setting.world_seed, np.arange(worlds))
     batch = drawn_worlds(ranges, drawn, setting)
-    return batch._replace(stage=DrawnStage(batch.stage, setting.physics, ranges.task))
+    origin = trial.Origin(setting.physics, ranges.task)
+    return batch._replace(worlds=batch.worlds._replace(origin=origin))
 
 
 @device.standard_jax()
@@ -161,14 +140,13 @@ def rollout(
         raise errors.not_allowed("world", f"of shape {np.shape(world.p_world_target)}", rule)
     params = freeze_functions(params)
     _check_scalars(params)
-    if isinstance(stage, DrawnStage):
-        stage.task.check_law(params)
-        for name, value in vars(stage.physics).items():
+    engine.check_stage(stage)
+    if world.origin is not None:
+        world.origin.task.check_law(params)
+        for name, value in vars(world.origin.physics).items():
             if (other := getattr(setting.physics, name)) != value:
                 rule = f"the worlds were drawn with {value}; give their setting"
                 raise errors.not_allowed(name, other, rule)
-        stage = stage.stage
-    engine.check_stage(stage)
     world = soften_skins(world) if smooth else world
     world, params, start = engine.guard_derivatives((world, params, start))
     fresh = trial.start(world, params, loop.law)

@@ -107,8 +107,6 @@ def parse_physics(physics: PhysicsLike, fidelity: Fidelity = "standard") -> Phys
     known = [field.name for field in fields(Physics)]
     for field, value in changes.items():
         errors.check_name("field of physics", field, known)
-        if isinstance(value, list):
-            changes[field] = tuple(value)
-        elif isinstance(getattr(base, field), int) and value in range(2**31):
+        if isinstance(getattr(base, field), int) and value in range(2**31):
             changes[field] = int(value)
     return replace(base, **changes)
