@@ -11,6 +11,7 @@ import jax
 import pytest
 from helpers import (
     PLAN,
+    ROOT,
     SLOTS,
     one_sentence,
     parts_of,
@@ -19,6 +20,7 @@ from helpers import (
     swept,
 )
 
+from rps_jax import Quantity, register_quantity, sweep
 from rps_jax.engines import device
 from rps_jax.record import files
 from rps_jax.record.cache import use_cache
@@ -83,6 +85,16 @@ def test_without_a_cluster_a_sweep_is_refused(wrong, domain, tmp_path, capsys, m
     error = one_sentence(capsys.readouterr().err.splitlines(keepends=True)[-1])  # after its bar
     message = "pip install 'rps_jax[cluster]'" if wrong == "missing" else f"ray = {address}"
     assert message in error
+
+
+def test_what_only_this_process_registers_is_refused(registries):
+    register_quantity("threshold", Quantity("1", "threshold", ge=0, le=1, owner="skin"))
+    law = f"{ROOT / 'notebooks/examples/custom_law.py'}:PParams"
+    for laws, name in {law: "PParams", "rps": "threshold"}.items():
+        with refusing(f"ray = with {name}"):
+            sweep(laws, "wide,threshold=0.2:1", ray="local", out="run")
+        with refusing("ray = with .*box.xml"):
+            sweep(laws, f"wide,objects={ROOT / 'mjcf/box.xml'}", ray="local", out="run")
 
 
 # --- a cluster of two workers --------------------------------------------------------------

@@ -33,6 +33,7 @@ from rps_jax.runs.plan import Plan, Shard, chunks_by_key
 from rps_jax.runs.results import store_chunk
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.trials.worlds import BatchOptions
+from rps_jax.world.objects import custom_solids
 
 PATIENCE = 10.0  # [s] to reach a cluster
 RETRIES = 16  # of a task
@@ -106,6 +107,19 @@ def connected(address: str, **options: object) -> Iterator[ModuleType]:
 def _last_line(error: BaseException) -> str:
     """Return the last line of a message, which names the fault, without its full stop."""
     return (str(error).strip().splitlines() or [type(error).__name__])[-1].rstrip(".")
+
+
+def check_registered(plan: Plan) -> None:
+    """Raise InputError for parts of a plan that the package does not register in a worker."""
+    domain = plan.domain
+    parts = map(type, (*plan.laws.values(), domain.task, plan.setting.simulator))
+    custom = [part.__name__ for part in parts if not part.__module__.startswith("rps_jax.")]
+    custom += [*dict(domain.custom), *custom_solids(domain.objects)]
+    if custom:
+        rule = (
+            "its workers have only what the package registers; run it in one process or in shards"
+        )
+        raise errors.not_allowed("ray", f"with {', '.join(custom)}", rule)
 
 
 def run_on_cluster(

@@ -186,6 +186,8 @@ class Sweep(SweepOptions, PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQues
             raise InputError("models is not allowed with ray or a shard: run it in one process.")
         if self.out is None and (self.ray or sharded):
             raise InputError("out = None is not allowed with ray or a shard: name a run folder.")
+        if self.ray:
+            cluster.check_registered(self.plan)
         super().check()
 
     def num_trials(self) -> int | None:
