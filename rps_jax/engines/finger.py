@@ -62,7 +62,7 @@ def check_outline(outline: ArrayLike) -> np.ndarray:
       InputError: there are fewer than three corners, sides cross, or the size is not in metres.
     """
     corners = errors.check_array("outline", outline, ("N", 2))
-    size = float(np.ptp(corners, axis=0).max()) if len(corners) else 0.0
+    size = float(np.ptp(corners, axis=0).max())
     if len(corners) < 3 or not 0.005 <= size <= 5:
         rule = "give 3 or more corners x, y [m] of an object of 0.005 to 5 m"
         raise errors.not_allowed("outline", f"{len(corners)} corners over {size:.3g} m", rule)

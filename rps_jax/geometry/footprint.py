@@ -54,18 +54,17 @@ def polygon(vertices: ArrayLike) -> Footprint:
 def check_corners(name: str, vertices: ArrayLike) -> np.ndarray:
     """Return the corners (N, 2) [m] of a convex polygon, or raise InputError: see `polygon`."""
     points = errors.check_array(name, vertices, ("N", 2))
-    if len(points) < 3:
-        rule = "give three corners or more, each as x, y [m]"
-        raise errors.not_allowed(name, points.tolist(), rule)
     edges = np.roll(points, -1, axis=0) - points
     following = np.roll(edges, -1, axis=0)
     turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
     turning = np.arctan2(turns, np.sum(edges * following, axis=1)).sum()
     if not (turns > 0).all() or not np.isclose(turning, 2 * np.pi):
-        rule = (
-            "the outline must be strictly convex and counter-clockwise from above, without "
-            "repeated corners; of a concave object, as an L, give the convex hull"
-        )
+        rule = "give three corners or more, each as x, y [m]"
+        if len(points) > 2:
+            rule = (
+                "the outline must be strictly convex and counter-clockwise from above, without "
+                "repeated corners; of a concave object, as an L, give the convex hull"
+            )
         raise errors.not_allowed(name, points.tolist(), rule)
     return points
 

@@ -171,16 +171,16 @@ class Shell:
         sides, previous = side_lengths(*self.sizes), (0, 0.0)  # side and end [m] of the row before
         for boards in self.boards:
             first, length = _span(boards, sides[boards.side])
-            last, end = first + length, sides[boards.side]
-            field = f"robot boards on the {boards.side} side"
+            last, end, rule = first + length, sides[boards.side], ""
+            side = SIDES.index(boards.side)
             if first < -_ROUNDING or last > end + _ROUNDING:
                 rule = f"they leave the base, whose side ends at {end:g} m"
-                raise errors.not_allowed(field, f"{first:g} to {last:g} m", rule)
-            side = SIDES.index(boards.side)
-            if (side, first + _ROUNDING) < previous:
+            elif (side, first + _ROUNDING) < previous:
                 rule = "write the rows in the order left, front, right"
                 if side == previous[0]:
                     rule = f"they overlap the previous row, which ends at {previous[1]:g} m"
+            if rule:
+                field = f"robot boards on the {boards.side} side"
                 raise errors.not_allowed(field, f"{first:g} to {last:g} m", rule)
             previous = side, last
 

@@ -274,11 +274,11 @@ class Domain:
 
     def with_changes(self, changes: Mapping[str, Any]) -> "Domain":
         """Return the domain with other fields, or ranges of registered quantities."""
-        fields_ = {name: x for name, x in changes.items() if name not in REGISTERED}
-        custom = dict(fields_.pop("custom", self.custom))
-        custom |= {name: x for name, x in changes.items() if name in REGISTERED}
-        drawn = tuple((name, x) for name, x in custom.items() if x is not None)
-        return replace(self, custom=drawn, **fields_)
+        fields_ = {"custom": self.custom, **changes}
+        custom = dict(fields_["custom"])
+        custom |= {name: fields_.pop(name) for name in REGISTERED & fields_.keys()}
+        fields_["custom"] = {name: x for name, x in custom.items() if x is not None}
+        return replace(self, **fields_)
 
     @property
     def surroundings(self) -> Surroundings:

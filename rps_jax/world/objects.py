@@ -356,17 +356,16 @@ def _geom_outline(label: str, model: mujoco.MjModel) -> Footprint:
             outline = fp.rectangle(geom.size[0], geom.size[1])
         elif geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER:
             outline = fp.circle(geom.size[0])
-    if outline is None:
-        reason = "the geom object is no upright box or cylinder about the origin"
-        raise errors.not_allowed(f"{label}: footprint", None, f"{reason}, so {_GIVE_OUTLINE}")
-    reach = max(
-        float(np.max(fp.signed_distance(outline, jnp.asarray(_points_of(model, i)[:, :2]))))
-        for i in np.flatnonzero(model.geom_bodyid == model.body("object").id).tolist()
-    )
-    if reach > _OVERHANG:
+    reason = "the geom object is no upright box or cylinder about the origin"
+    if outline is not None:
+        reach = max(
+            float(np.max(fp.signed_distance(outline, jnp.asarray(_points_of(model, i)[:, :2]))))
+            for i in np.flatnonzero(model.geom_bodyid == model.body("object").id).tolist()
+        )
+        if reach <= _OVERHANG:
+            return outline
         reason = f"its geoms reach {reach:.2g} m beyond the geom object, which alone has contacts"
-        raise errors.not_allowed(f"{label}: footprint", None, f"{reason}, so {_GIVE_OUTLINE}")
-    return outline
+    raise errors.not_allowed(f"{label}: footprint", None, f"{reason}, so {_GIVE_OUTLINE}")
 
 
 def _outline(label: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
