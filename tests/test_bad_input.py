@@ -247,6 +247,7 @@ COMMANDS = {
     "hello.py puhs": {"": "unknown command 'puhs': .*did you mean 'push'"},
 }
 TASKS = {
+    "push --quick": "unknown option '--quick'",
     "push --task nofile.json": "nofile.json cannot be read",
     "push --task path,nofile.json": "nofile.json cannot be read",
     "push --task no_path.json": "waypoints as [[0.4, 0], [2, 1]], or a map",

@@ -253,6 +253,20 @@ test_invalid_rollouts_are_refused = refusals(
     (ROUTE | {"world": BATCH}, "world = a WorldBatch is not allowed: give a World"),
     (ROUTE | {"setting": Setting("mujoco")}, "engine = mujoco is not allowed"),
     (ROUTE | {"setting": Setting()}, "engine = fused .* worlds were drawn for quasistatic"),
+    (
+        ROUTE | {"setting": Setting("quasistatic", "default,support=even")},
+        "support = even is not allowed: the worlds were drawn with corners",
+    ),
+    (
+        ROUTE
+        | {
+            "params": LAWS["pose"],
+            "world": row(
+                trajectory.draw_worlds(TOUCHING, task="path", setting=QUASISTATIC).worlds, 0
+            ),
+        },
+        "task = path with the law pose is not allowed",
+    ),
     (ROUTE | {"params": 3.0}, "params = 3.0"),
     (
         ROUTE | {"params": RPSParams(K_h=np.ones(4))},

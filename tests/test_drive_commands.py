@@ -111,6 +111,8 @@ def test_the_ladder_and_the_score_use_the_laws_that_the_base_can_follow():
     assert set(Ladder(robot=robot).chosen) == set(known)
     # No law of the package brings objects to a heading with a car.
     assert list(Score("unicycle_car", robot="f1tenth", task="pose").chosen) == ["unicycle_car"]
+    assert list(Score("rps", task="corridor,heading=0").chosen) == ["rps"]
+    assert "rps_reposition" not in Ladder(task="corridor").chosen
 
 
 @pytest.mark.parametrize("drive", ROBOTS)

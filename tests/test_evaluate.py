@@ -33,6 +33,7 @@ from rps_jax.tuning.learn import Learn
 from rps_jax.tuning.space import Space
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
+from rps_jax.world.physics import Physics
 
 CYLINDERS = replace(DOMAINS["wide"], objects=("random_cylinder",))
 BRIEF = setting_of(8.0)
@@ -131,6 +132,12 @@ def test_a_split_of_a_setting_is_that_of_its_worlds_and_of_its_record():
     assert tuning.attributes == {"seed": 3, "engine": "quasistatic", "split": "tune"}
     with refusing("choose from tune, validate, test"):
         Setting(split="train")
+
+
+def test_a_setting_has_numbers_of_python():
+    tenths = Physics(timestep=jnp.float32(0.5**6), control_period=0.5**5, base_solref=[0.02, 1])
+    assert hash(tenths) == hash(Physics(0.5**6, 0.5**5))
+    assert Setting(seed=np.int32(3), split="tune").world_seed == seed_of(3, "tune")
 
 
 def test_results_are_labelled_as_those_of_a_sweep():

@@ -302,6 +302,10 @@ def test_the_command_writes_a_folder_with_the_chosen_parameters(tmp_path, capsys
     assert rps(f"export c {options} --out", out) == 0
     assert str(out / "mine.h") in capsys.readouterr().out
     assert {path.name for path in out.iterdir()} == {"mine.h", "main.c"}
+    (out / "main.c").write_text("edited")
+    with pytest.warns(UserWarning, match="main.c is kept"):
+        assert rps(f"export c {options} --out", out) == 0
+    assert (out / "main.c").read_text() == "edited"
     header = (out / "mine.h").read_text()
     assert "(mine_real)0.37, /* press */" in header
     assert "#define MINE_TAXELS 51" in header

@@ -198,6 +198,10 @@ def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_
         rps_jax.fit_object(SQUARE, table.assign(tip_x=1.0 + table.tip_x), RADIUS)
     with refusing("give 3 to 64 points"):
         rps_jax.fit_object(SQUARE, table, RADIUS, feet=SQUARE[:2])
+    with refusing("feet = up to .* m from its middle"):
+        rps_jax.fit_object(SQUARE, table, RADIUS, feet=1000 * SQUARE)
+    with refusing("pushes = None is not allowed"):
+        rps_jax.fit_object(SQUARE, None, RADIUS)
     with refusing("prior size deviation = 0.0 is not allowed: .* above 0"):
         rps_jax.fit_object(SQUARE, table, RADIUS, prior={"size": (0.0, 0.0)})
     with refusing("pushes .push, time, .* = nan at index .2, 4. is not allowed"):

@@ -1,6 +1,7 @@
 """Laws for robots and browsers: `rps export c`, `rps export js`, `rps export onnx`."""
 
 import functools
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +64,13 @@ class Export(Command[Path]):
     def execute(self, callback: ProgressCallback) -> Path:
         out, texts = Path(self.out or self.default_folder), self.texts()
         for name, text in texts.items():
-            files.write_bytes(out / name, text if isinstance(text, bytes) else text.encode())
+            content = text if isinstance(text, bytes) else text.encode()
+            path = out / name
+            if name == "main.c" and path.exists() and path.read_bytes() != content:
+                text = f"{path} is kept, since it differs from the example: remove it for a new one"
+                warnings.warn(text, stacklevel=2)
+            else:
+                files.write_bytes(path, content)
         return out / next(iter(texts))
 
 

@@ -280,6 +280,8 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
       ('time',)
     """
 
+    quick: bool = option(False, hidden=True)
+
     def __post_init__(self) -> None:
         """Defer the checks of `Case` to `check`."""
         SimulationQuestion.__post_init__(self)
@@ -299,6 +301,8 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
 
     def check(self) -> None:
         super().check()
+        if self.quick:
+            raise errors.not_allowed("quick", True, "a push has no smaller run; omit it")
         self.setting.check_here(self.case.base, [self.case.params])
 
     def answer(self, run: Run) -> Trace:

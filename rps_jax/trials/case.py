@@ -146,12 +146,18 @@ def suited_laws(
     """
     if task is None or heading_of(task) is None:
         known = registry.laws_for(robot.drive)
-        return tuple(x for x in laws if x in known) or (unicycle.PRESET_OF[robot.drive],)
-    if (name := pose.preset_of(robot)) is None:
+        suited = tuple(x for x in laws if x in known) or (unicycle.PRESET_OF[robot.drive],)
+    elif (name := pose.preset_of(robot)) is None:
         base = f"drive = {robot.drive}" if robot.radius is None else "a round base"
         rule = f"no law for {base} brings objects to a heading; name a custom law, or another robot"
         raise errors.not_allowed("task", task, rule)
-    return (name if task.HAS_TARGET else f"path_{name}",)
+    else:
+        suited = (name if task.HAS_TARGET else f"path_{name}",)
+    if task is not None:
+        first, suited = suited[0], tuple(x for x in suited if not task.law_fault(registry.LAWS[x]))
+        if not suited:
+            task.check_law(registry.LAWS[first])
+    return suited
 
 
 def friction_of(friction: FrictionLike) -> Friction:

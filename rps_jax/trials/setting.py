@@ -80,6 +80,7 @@ class Setting:
 
     def __post_init__(self) -> None:
         options.check_fields(self)
+        object.__setattr__(self, "seed", int(self.seed))  # those of NumPy overflow
         self.rules.check()
         if self.physics.cone != "elliptic":  # all engines have this one: import no engine
             self.simulator.check_physics(self.physics)
@@ -146,8 +147,6 @@ class Setting:
     @classmethod
     def from_json(cls, record: JsonObject) -> Setting:
         """Return the setting of a record with the fields of `to_json`."""
-        fields = dict(record["physics"]).items()
-        values: JsonObject = {k: tuple(x) if isinstance(x, list) else x for k, x in fields}
-        physics, rules = Physics(**values), Rules(**record["rules"])
+        physics, rules = Physics(**record["physics"]), Rules(**record["rules"])
         seed, split = record["seed"], record.get("split")
         return cls(record["engine"], physics, rules=rules, seed=seed, split=split)

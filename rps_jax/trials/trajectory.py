@@ -71,7 +71,9 @@ def draw_worlds(
     setting.simulator.check_traced()
     setting.check_domain(ranges)
     drawn = draws.draw(ranges, setting.world_seed, np.arange(worlds))
-    return drawn_worlds(ranges, drawn, setting)
+    batch = drawn_worlds(ranges, drawn, setting)
+    origin = trial.Origin(setting.physics, ranges.task)
+    return batch._replace(worlds=batch.worlds._replace(origin=origin))
 
 
 @device.standard_jax()
@@ -139,6 +141,12 @@ def rollout(
     params = freeze_functions(params)
     _check_scalars(params)
     engine.check_stage(stage)
+    if world.origin is not None:
+        world.origin.task.check_law(params)
+        for name, value in vars(world.origin.physics).items():
+            if (other := getattr(setting.physics, name)) != value:
+                rule = f"the worlds were drawn with {value}; give their setting"
+                raise errors.not_allowed(name, other, rule)
     world = soften_skins(world) if smooth else world
     world, params, start = engine.guard_derivatives((world, params, start))
     fresh = trial.start(world, params, loop.law)

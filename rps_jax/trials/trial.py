@@ -50,7 +50,7 @@ from rps_jax.spec import Spec
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
 from rps_jax.world.tasks import reach
-from rps_jax.world.tasks.base import Positions
+from rps_jax.world.tasks.base import Positions, Task
 
 # A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
 _MAX_SPEED = 20.0  # [m/s], [rad/s]
@@ -103,6 +103,15 @@ class Shift(NamedTuple):
     ] = (0.0, 0.0)
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Origin:
+    """Physics and task with which worlds were drawn."""
+
+    physics: Physics
+    task: Task
+
+
 class World(NamedTuple):
     """Object, robot, sensors and task of one world; every leaf is batched."""
 
@@ -116,6 +125,7 @@ class World(NamedTuple):
     odometry: Odometry = Odometry()
     robot: Robot | None = None  # with limits; None follows every twist
     task: Pytree = reach.Nothing()  # a `Course`
+    origin: Origin | None = None  # of worlds for `rollout`
 
 
 class Trial(NamedTuple):

@@ -268,11 +268,14 @@ class ObjectFit:
         )
 
 
-def _pads_of(feet: ArrayLike) -> np.ndarray:
-    """Return pads (S, 4) of equal loads at feet (S, 2) [m]."""
+def _pads_of(feet: ArrayLike, outline: np.ndarray) -> np.ndarray:
+    """Return pads (S, 4) of equal loads at feet (S, 2) [m] under an outline."""
     at = errors.check_array("feet", feet, ("S", 2))
     if not 3 <= len(at) <= _PADS:
         raise errors.not_allowed("feet", f"{len(at)} points", f"give 3 to {_PADS} points x, y [m]")
+    if (away := np.abs(at - outline.mean(axis=0)).max()) > 2 * _half_size(outline):
+        rule = "they are under the object: give x, y [m] in the frame of the outline"
+        raise errors.not_allowed("feet", f"up to {away:.3g} m from its middle", rule)
     return np.column_stack([at, np.full(len(at), 1 / len(at)), np.full(len(at), _FOOT)])
 
 
@@ -424,7 +427,7 @@ class FitObject(Question[ObjectFit]):
     outline: str | Any = option("", positional=True)
     """Corners x, y [m] of a simple polygon in the object's frame: an array, or a table FILE.csv
     with the columns x and y."""
-    pushes: str | Any = option("", positional=True)
+    pushes: PushesLike = option("", positional=True)
     """Table FILE.csv of pushes: push, time, x, y, yaw of the object, tip_x, tip_y of the finger's
     middle; in Python also a data frame."""
     radius: float = option(0.005, 1e-4, 0.5, unit="m")
@@ -446,9 +449,16 @@ class FitObject(Question[ObjectFit]):
             outline = corners[["x", "y"]].to_numpy(float)
         return finger.check_outline(outline), read_pushes(self.pushes)
 
+    @functools.cached_property
+    def _pads(self) -> np.ndarray:
+        """Pads (S, 4) under the object: at its feet, or under all of its outline."""
+        corners = self._inputs[0]
+        return finger.uniform_pads(corners) if self.feet is None else _pads_of(self.feet, corners)
+
     def check(self) -> None:
         super().check()
         _check(*self._inputs, self.radius, self.prior or PRIOR)
+        _ = self._pads
 
     def fields_as_json(self) -> JsonObject:
         """Fields as JSON; outline and pushes by the digest of their values."""
@@ -460,8 +470,7 @@ class FitObject(Question[ObjectFit]):
         """Fit the object to the pushes."""
         corners, data = self._inputs
         mean, deviation = np.array([*{**PRIOR, **(self.prior or {})}.values()]).T
-        pads = finger.uniform_pads(corners) if self.feet is None else _pads_of(self.feet)
-        fixed, size = _fixed(corners, pads, self.radius), _half_size(corners)
+        fixed, size = _fixed(corners, self._pads, self.radius), _half_size(corners)
         turn = size * solid.wrap(data.end[:, 2] - data.start[:, 2])
         way = _distance(data.end, data.start)
         unit = _LOSS[0] + _LOSS[1] * np.nan_to_num(np.abs(np.stack([way, way, turn], axis=1)))
@@ -512,7 +521,7 @@ class FitObject(Question[ObjectFit]):
             "gap": ("push", gaps),
         }
         data_set = xr.Dataset(columns, {"parameter": list(PRIOR)})
-        fitted = ObjectFit(data_set, corners, self.radius, _QUANTILE, pads)
+        fitted = ObjectFit(data_set, corners, self.radius, _QUANTILE, self._pads)
         return fitted if np.isnan(data.end).any() else _calibrated(fitted, data)
 
     def report(self, results: ObjectFit, run: Run) -> Sequence[Section]:

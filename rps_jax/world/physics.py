@@ -6,7 +6,7 @@ from typing import Literal
 
 from rps_jax import errors
 from rps_jax.geometry.solid import Support
-from rps_jax.record.options import check_fields, option, parse_changes
+from rps_jax.record.options import check_fields, option, parse_changes, to_json
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class Physics:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        for name, value in to_json(self).items():  # numbers of Python, as a static record needs
+            object.__setattr__(self, name, tuple(value) if isinstance(value, list) else value)
         if self.support != "corners" and self.cone == "pyramidal":
             raise errors.not_allowed("support", self.support, "a friction pyramid has corners")
         steps = self.control_period / self.timestep
@@ -105,8 +107,6 @@ def parse_physics(physics: PhysicsLike, fidelity: Fidelity = "standard") -> Phys
     known = [field.name for field in fields(Physics)]
     for field, value in changes.items():
         errors.check_name("field of physics", field, known)
-        if isinstance(value, list):
-            changes[field] = tuple(value)
-        elif isinstance(getattr(base, field), int) and value in range(2**31):
+        if isinstance(getattr(base, field), int) and value in range(2**31):
             changes[field] = int(value)
     return replace(base, **changes)

@@ -138,8 +138,8 @@ class Task:
         """Whether the object touches walls by contact forces."""
         return False
 
-    def check_law(self, params: LawParams) -> None:
-        """Raise InputError unless a law suits the room around the object, and a moving target."""
+    def law_fault(self, params: LawParams) -> str:
+        """Return why a law does not suit the room around the object, or a moving target."""
         law, rule = registry.law_of(params), ""
         if not self.HAS_TARGET and law.heading and not law.follows:
             rule = "its target moves along a path, which the law does not follow; "
@@ -149,7 +149,11 @@ class Task:
             rule += f"not {self.free_room:g} m; choose another law"
             if wider := " or ".join(self.ROOM_OPTIONS):
                 rule += f", or give the task a greater {wider}"
-        if rule:
+        return rule
+
+    def check_law(self, params: LawParams) -> None:
+        """Raise InputError unless a law suits the task."""
+        if rule := self.law_fault(params):
             name = f"{self.kind} with the law {registry.name_of(params)}"
             raise errors.not_allowed("task", name, rule)
 
