@@ -49,13 +49,6 @@ def replayed(run, law):
 
 CASES = {
     "a law in C, in hostile worlds": ("rps_plus", "hostile,objects=random_prism"),
-    "a law that XLA compiles, along a path": (
-        "learned",
-        "wide,objects=random_cylinder",
-        "path",
-        "fused",
-        1.0,
-    ),
     "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
 }
 HALL = {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]], "start": [1.5, 3, 0], "goal": [7, 3]}
@@ -64,6 +57,13 @@ TASKS = {
     "rooms": HALL,
 }  # with places for the widest object
 SLOW_CASES = {
+    "a law that XLA compiles, along a path": (
+        "learned",
+        "wide,objects=random_cylinder",
+        "path",
+        "fused",
+        1.0,
+    ),
     "a law that senses force, on a robot with limits in a corridor": (
         "force_push_published",
         "real,objects=random_cylinder",
@@ -81,12 +81,10 @@ SLOW_CASES = {
 
 
 SLOW = [slow(x) for x in SLOW_CASES.values()]
-# Of each compiler: C here, and XLA below.
-COMPILED = "a law in C, in hostile worlds"
-QUICK = [pytest.param(x, marks=[pytest.mark.parity] * (k == COMPILED)) for k, x in CASES.items()]
 
 
-@pytest.mark.parametrize("case", [*QUICK, *SLOW], ids=[*CASES, *SLOW_CASES])
+@pytest.mark.parity  # of a trial in C, and of a law in XLA
+@pytest.mark.parametrize("case", [*CASES.values(), *SLOW], ids=[*CASES, *SLOW_CASES])
 def test_a_replay_has_the_bits_of_its_sweep(case, tmp_path):
     results = sweep(tmp_path, *case)
     with warnings.catch_warnings(action="error"):
@@ -111,7 +109,6 @@ def test_the_bits_depend_on_the_stored_number_of_slots(run):
     assert counts == {2, SLOTS}  # there are 3 cylinders and 2 boxes
 
 
-@pytest.mark.parity
 def test_replays_in_a_planar_engine_have_the_bits_of_their_sweep(run):
     folder, results = run
     assert_equal_bits(replayed(folder, "rps"), results)
@@ -141,11 +138,10 @@ def test_a_film_has_the_bits_of_its_sweep(run):
 def test_a_viewed_trial_has_the_bits_of_its_sweep(run):
     folder, results = run
     plan = load_plan(folder)
-    for i in (1,):
-        slots = push.program_slots(folder, plan, "rps", i)
-        live = Live(build_batch(plan, "rps", [i]), plan.setting, slots)
-        live.step(100_000)
-        assert_equal_bits(live.outcome.columns(), results.sel(world=i))
+    slots = push.program_slots(folder, plan, "rps", 1)
+    live = Live(build_batch(plan, "rps", [1]), plan.setting, slots)
+    live.step(100_000)
+    assert_equal_bits(live.outcome.columns(), results.sel(world=1))
 
 
 def test_a_trial_that_ends_otherwise_is_named(run, monkeypatch, tmp_path, capsys):

@@ -397,7 +397,7 @@ def test_a_law_refuses_invalid_parameters_and_restores_valid_ones(name):
 @pytest.mark.parametrize(
     "name",
     [
-        x if x in ("force_push", "pursuit") else slow(x)
+        x if x == "pursuit" else slow(x)
         for x in sorted(RIVALS.keys() - {"force_push_published", "learned_mlp"})
     ],
 )

@@ -161,7 +161,7 @@ def integrals():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(quasistatic, "_LEAST_RADIUS", 1e-3)
         for kind in KINDS:
-            at, share = distribution("box", kind, {"even": 18, "rim": 30}[kind])
+            at, share = distribution("box", kind, {"even": 18, "rim": 36}[kind])  # 144 points
             inputs, qpos = inputs_of("box", "corners")
             box = inputs.solids
             feet = np.column_stack([at, share])[None]

@@ -87,13 +87,12 @@ def test_rare_termination_checks_on_a_gpu_do_not_change_results(monkeypatch):
 # Two shape families, side by side in a merged batch of a GPU.
 FAMILIES = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
 FAMILIES += [case((0.6, 0.1 * k), name="cylinder") for k in range(3)]
-LONGER = Rules(horizon=60.0)
 
 
 @pytest.fixture(scope="module")
 def sequential():
     """Outcomes of both families, one after the other."""
-    return run(FAMILIES, LONGER)
+    return run(FAMILIES)
 
 
 @pytest.mark.parametrize("tail_slots", [slow(1), 3, SLOTS])
@@ -103,7 +102,7 @@ def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, sequential
     monkeypatch.setattr(batch, "_tail_slots", lambda: tail_slots)
     note = lambda self, device: ran.append(self.slots) or plain(self, device)  # noqa: E731
     monkeypatch.setattr(batch._Program, "compiled", note)
-    results = run(FAMILIES, LONGER, callback=lambda progress: segments.append(progress.segment))
+    results = run(FAMILIES, callback=lambda progress: segments.append(progress.segment))
     assert ran[0] == (SLOTS, 3)
     # None is left to a last slot alone.
     assert ran[1:] == ([(3, 3)] if tail_slots == 3 else [])

@@ -401,7 +401,7 @@ def test_the_report_of_a_descent_tells_its_times_and_parameters(pretended):
 
 
 def test_the_command_line(tmp_path, capsys):
-    words = "tune es --engine quasistatic --objects random_cylinder --worlds 2 --validation 2"
+    words = "tune es --engine fused --objects random_cylinder --worlds 2 --validation 2"
     words += " --population 4 --generations 2 --horizon 8 --tuned L K_h --slots 8 --out"
     calls = [*words.split(), tmp_path / "run"]
     assert command(*calls) == 0
