@@ -312,8 +312,9 @@ SLIPS = dict.fromkeys(("robot_slip", "robot_slip_sideways", "robot_slip_yaw"), R
 @pytest.mark.parametrize(
     ("law", "options"),
     [
-        ("rps", {"skin": "ideal"}),
-        *((x, {}) for x in ("rps", "aps", "rps_plus", "pursuit", "dipole")),
+        slow("rps", {"skin": "ideal"}),
+        *((x, {}) for x in ("rps", "rps_plus", "pursuit")),
+        *(slow(x, {}) for x in ("aps", "dipole")),
         slow("rps", {"domain": "real", **SLIPS}),
     ],
 )
@@ -414,12 +415,6 @@ def test_a_custom_law_is_compared_with_xla_before_a_run_once(mine, cache, monkey
         with pytest.warns(UserWarning, match="law of MineParams gives other results as compiled"):
             law_check.warn_of_difference(part.with_params(mine), setting)
         monkeypatch.setattr(native, "batched", None)  # the result is cached
-
-
-def test_a_law_of_the_package_is_not_compared(monkeypatch):
-    monkeypatch.setattr(law_check, "warn_of_difference", None)
-    setting = setting_of(0.2, "fused")
-    assert sweep("rps", "wide,objects=box,gap=0.01", worlds=2, setting=setting).sizes["world"] == 2
 
 
 def test_a_sweep_of_a_custom_law_is_a_push_in_xla(mine, tmp_path, monkeypatch):

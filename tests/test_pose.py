@@ -549,13 +549,6 @@ def test_tolerances_are_options_of_the_task():
     assert str(task) == "pose,heading=1.2:1.2,d_success=0.02,yaw_success=0.05"
 
 
-@pytest.mark.slow
-def test_the_law_delivers_to_a_target_without_a_heading():
-    outcome, _ = pushes.run([Case(law=FAST, target=(1.5, 0.0), task="reach")], Setting("fused"))
-    assert outcome.success.all()
-    assert LAW.heading
-
-
 def test_a_heading_relative_to_a_face_has_no_arrow_in_the_world_and_no_environment(monkeypatch):
     monkeypatch.setattr("rps_jax.trials.live.stepper", still)
     setting = Setting("fused")

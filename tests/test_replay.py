@@ -4,7 +4,6 @@ import dataclasses
 import warnings
 from functools import partial
 
-import jax
 import numpy as np
 import pytest
 from helpers import refusing, rps, setting_of, slow
@@ -16,11 +15,8 @@ from rps_jax.record import files
 from rps_jax.runs import push
 from rps_jax.runs.plan import build_batch, load_plan
 from rps_jax.studies import gallery
-from rps_jax.trials import pushes, trial
-from rps_jax.trials.case import Case
 from rps_jax.trials.live import Live
 from rps_jax.trials.progress import SequentialProgress, no_progress
-from rps_jax.trials.trial import ControlLoop
 from rps_jax.world.domain import DOMAINS
 
 WORLDS = 5
@@ -164,21 +160,3 @@ def test_an_unknown_law_or_world_is_refused(run):
     folder, _ = run
     with refusing("unknown law of the run"):
         rps_jax.replay(folder, 0, "aps")
-
-
-def test_a_gpu_stops_at_any_number_of_steps(monkeypatch):
-    """It runs more steps at once than are wanted, which change nothing."""
-    setting = rps_jax.Setting("quasistatic")
-    worlds = pushes.build([Case("cylinder")], setting)
-    loop = ControlLoop(setting.physics, setting.rules, worlds.law)
-    start = trial.start_all(*worlds.inputs, np.ones(1, bool), law=loop.law)
-
-    def stepped(steps):
-        advance = jax.jit(lambda *x: trial.advance([(worlds.stage, *x)], loop, steps))
-        return jax.device_get(advance(*worlds.inputs, start))[0]
-
-    on_cpu = stepped(7)
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    on_gpu = stepped(7)
-    assert on_gpu.steps == 7
-    jax.tree.map(assert_array_equal, on_gpu, on_cpu)

@@ -347,7 +347,7 @@ def twist_of(name, touch, p_object, force=(-20.0, 5.0)):
     return np.asarray(second_twist(law, params, observation))
 
 
-@pytest.mark.parametrize("name", RIVALS)
+@pytest.mark.parametrize("name", [slow(x) if x.startswith("path_pose") else x for x in RIVALS])
 def test_a_law_is_symmetric_and_does_not_depend_on_the_frame(name):
     rng, flip = default_rng(3), np.array([1.0, -1.0])
     for _ in range(8):
