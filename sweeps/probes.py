@@ -64,6 +64,8 @@ PROBES = {
     "pose": f"sweep --worlds 16 --laws pose --task pose --domain {_BOX} --horizon 60",
     "pose_drive": "sweep --worlds 16 --laws pose_drive,v_free=0.05,omega_free=0.15 --task pose "
     f"--robot ideal,drive=differential --domain {_BOX} --horizon 60",
+    "pose_narrow": "sweep --worlds 16 --laws pose_medium pose_narrow --task pose "
+    f"--robot turtlebot4 --domain {_BOX} --horizon 60",
     "path": f"{_FAST} {_NETWORK} --task path {_SHORT}",
     "corridor": f"{_FAST} {_NETWORK} --task corridor {_SHORT}",
     "floor": f"{_FAST} --domain wide,slope=0:0.05,boundary_factor=1:2 {_SHORT}",
@@ -105,6 +107,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "drives": ("drives", "wide", "hostile", "real"),
     "pose_parity": ("pose",),
     "pose_paths": ("pose", "pose_drive", "path"),
+    "pose_presets": ("pose_drive", "pose_narrow"),
     "pose*": ("pose", "pose_drive"),
     "drives_omni": ("wide", "hostile", "real"),
     "drives_engines": ("drives", "push_mujoco"),

@@ -212,7 +212,7 @@ def small_run(folder: Path, **changes: Any) -> None:
     drums = rps_jax.Domain(("random_cylinder",))
     laws = {"rps": rps_jax.RPSParams.paper(), "rps tuned": rps_jax.RPSParams.tuned()}
     setting = setting_of(2.0)
-    options = {"worlds": 12, "setting": setting, "out": folder, "part": 4, "progress": False}
+    options = {"worlds": 8, "setting": setting, "out": folder, "part": 4, "progress": False}
     rps_jax.sweep(laws, drums, **options | changes)
 
 
@@ -231,14 +231,12 @@ def encrypted() -> bytes:
 
 def values(limit: int, seed: int) -> Iterator[Fault]:
     """Yield some options of all commands with some values, in random order."""
-    from command_line import flags_of
-
-    from rps_jax.app.cli import names
+    from command_line import RECORD
 
     cases = [
         (*name.split(), *NEEDS.get(name, ()), option, value)
-        for name in names.known()
-        for option in flags_of(name)
+        for name, options in json.loads(RECORD.read_text()).items()
+        for option in options
         for value in VALUES
         if option.startswith("--")
         if not (option == "--out" and value in ("/", "..", "~"))  # these may be writable

@@ -86,7 +86,7 @@ def test_another_run_is_not_written_over_it_unasked(runs, capsys):
     assert (runs[0] / "results.nc").read_bytes() == content
 
 
-QUICK_PUSH = "push --engine quasistatic --horizon 1 --no-video --target"
+QUICK_PUSH = "push --object cylinder --engine quasistatic --horizon 1 --no-video --target"
 QUASISTATIC = "--engine quasistatic --horizon 8 --slots 8 --workers 1"
 
 

@@ -444,22 +444,25 @@ def test_a_gradient_is_useful_if_it_predicts_a_change_of_one_percent():
         assert any("do not predict the effect" in str(x.message) for x in caught) == (not useful)
 
 
+def detailed(x, goal):
+    """Return distance driven ahead and to go, less that of the goal, and what a score sees."""
+    seen = {"executed": x.executed, "qpos": x.state.qpos, "l_th": x.state.law_state.l_th}
+    seen |= {"end": x.qpos[-1], "radius": x.world.footprint.radius}
+    seen |= {} if x.state.load is None else {"force": x.force}
+    return jnp.sum(x.executed[:, 0]) + final_distance(x) - goal["distance"], seen
+
+
+def detailed_value(setting=QUASISTATIC, goal=0.0):
+    """Return the results of `detailed`, and what it saw."""
+    options = DRUMS | {"setting": setting, "horizon": 0.4, "has_aux": True, "states": True}
+    return rps_jax.value_and_grad(detailed, wrt="v_max", args=({"distance": goal},), **options)
+
+
 def test_other_arguments_and_another_seed_compile_nothing_and_more_is_returned():
-    def score(trajectory, goal):
-        distance = final_distance(trajectory) - goal["distance"]
-        return distance, {"end": trajectory.qpos[-1], "radius": trajectory.world.footprint.radius}
-
-    def value(goal, seed):
-        options = DRUMS | {"has_aux": True, "setting": Setting("quasistatic", seed=seed)}
-        results, aux = rps_jax.value_and_grad(
-            score, wrt="v_max", args=({"distance": goal},), **options
-        )
-        return results.value.values, aux
-
-    first, aux = value(0.0, 0)
+    first, aux = detailed_value()
     count = derivatives._value_and_slopes._cache_size()
-    np.testing.assert_allclose(value(0.5, 0)[0], first - 0.5, rtol=1e-5)
-    assert (value(0.0, 1)[0] != first).all()
+    np.testing.assert_allclose(detailed_value(goal=0.5)[0].value, first.value - 0.5, rtol=1e-5)
+    assert (detailed_value(Setting("quasistatic", seed=1))[0].value != first.value).all()
     assert derivatives._value_and_slopes._cache_size() == count
     assert aux["end"].shape == (1, 4, 10)
     assert (aux["radius"] > 0).all()
@@ -467,12 +470,7 @@ def test_other_arguments_and_another_seed_compile_nothing_and_more_is_returned()
 
 @pytest.mark.parametrize("engine", ["quasistatic", slow("fused")])
 def test_a_score_sees_velocities_forces_and_the_state_of_the_law(engine):
-    def score(x):
-        seen = {"executed": x.executed, "qpos": x.state.qpos, "l_th": x.state.law_state.l_th}
-        return jnp.sum(x.executed[:, 0]), seen | ({"force": x.force} if engine == "fused" else {})
-
-    options = DRUMS | {"setting": Setting(engine), "horizon": 0.4, "has_aux": True}
-    results, aux = rps_jax.value_and_grad(score, wrt="v_max", states=True, **options)
+    results, aux = detailed_value(Setting(engine))
     steps = np.diff(aux["qpos"][0], axis=1)
     way = np.linalg.norm(steps[..., :2], axis=-1) / 0.02
     speed = np.linalg.norm(aux["executed"][0][..., :2], axis=-1)[:, 1:]

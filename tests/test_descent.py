@@ -101,10 +101,10 @@ def test_antithetic_steps_find_the_slope_of_the_objective():
 
 
 def test_a_descent_names_slopes_without_a_sample_and_steps_without_them():
-    question = by_slopes(generations=3)
-    _, estimate = question.antithetic(jnp.zeros(2), 0, 2)
+    question = by_slopes(generations=3, worlds=3, pairs=4000)
+    _, estimate = question.antithetic(jnp.zeros(2), 0, 3)
     with pytest.warns(UserWarning, match="2 of 2 slopes have no finite sample"):
-        slopes = estimate(CandidateScores(None, np.full((2, 2), np.nan)))
+        slopes = estimate(CandidateScores(None, np.full((8000, 3), np.nan)))
     assert np.isnan(slopes.gradient).all()
     search = question.search()
     start = next(search)["vectors"]

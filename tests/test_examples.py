@@ -333,11 +333,11 @@ def test_a_custom_domain_draws_within_its_ranges(capsys):
 
 def test_a_custom_optimiser_needs_only_evaluate(capsys):
     names = example("custom_optimiser")
-    best, tested = names["main"](worlds=3, generations=1, horizon=1.0)
+    best, tested = names["main"](worlds=1, generations=1, horizon=1.0)
     assert "K_h" in capsys.readouterr().out
     for value, (low, high) in zip(best, names["BOUNDS"].values(), strict=True):
         assert low <= value <= high
-    assert dict(tested.success.sizes) == {"candidate": 2, "world": 24}
+    assert dict(tested.success.sizes) == {"candidate": 2, "world": 8}
 
 
 def test_the_command_line_accepts_registered_names(tmp_path, capsys, hexagon):

@@ -300,7 +300,7 @@ def test_a_design_needs_four_worlds_for_each_factor():
 
 
 def test_the_command_of_sensitivity_draws_and_continues(tmp_path, capsys):
-    options = "--engine quasistatic --horizon 3 --slots 8 --workers 1 --out"
+    options = "--engine mujoco --horizon 1 --slots 8 --workers 1 --out"
     assert rps(f"sensitivity --domain hardware --worlds 32 {options}", tmp_path) == 0
     assert "Trials fail at" in capsys.readouterr().out
     for name in ("sobol", "interactions"):
@@ -354,7 +354,7 @@ def test_gains_and_losses_by_hand():
 
 
 def test_the_command_of_regress_reports_known_laws(tmp_path, capsys):
-    options = "--engine quasistatic --horizon 20 --slots 8 --workers 1 --out"
+    options = "--engine mujoco --horizon 5 --slots 8 --workers 1 --out"
     text = printed(capsys, f"regress --laws rps --worlds 1 {options}", tmp_path)
     assert "rps_plus (file)" in text
     assert "simulated s per s" in text

@@ -22,7 +22,7 @@ from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.record import options
 
-SHARE = {"values": 15, "laws": 250, "edits": 2}
+SHARE = {"values": 15, "laws": 120, "edits": 2}
 
 
 @pytest.mark.parametrize("name", SHARE)

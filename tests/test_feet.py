@@ -169,8 +169,8 @@ def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
 @pytest.mark.parametrize(
     ("engine", "name"),
     [
-        ("fused", "random_box"),
         ("fused", "random_cylinder"),
+        slow("fused", "random_box"),
         slow("mjx", "random_cylinder"),
     ],
 )

@@ -46,7 +46,7 @@ def in_order(takes, name="labels"):
 
 
 def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(film, "_FILM_SIZE", (640, 360))  # smaller is drawn sooner
+    monkeypatch.setattr(film, "_FILM_SIZE", (320, 180))  # smaller is drawn sooner
     open_run(tmp_path, plan_of("random_cylinder"))
     out = tmp_path / "two.mp4"
     assert rps(f"film {tmp_path} --grid 2x4 --seconds 2 --speed 4.8 --out {out}") == 0
@@ -57,7 +57,7 @@ def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(tmp_path, monkeyp
     assert film.Film(tmp_path, out=out, overwrite=True).in_free_place().out == out
     images = decode(out)
     # 20 control steps of 0.02 s a frame: at 0, 0.4, ... 2 s, and the last for a second more.
-    assert images.shape == (6 + FPS, 180, 2 * 320, 3)  # two worlds fill the picture
+    assert images.shape == (6 + FPS, 134, 2 * 240, 3)  # two worlds fill the picture
     cells = tiles(images, 1, 2)
     for column in (0, 1):
         assert cells[0, 0, column].std() > 10
@@ -153,7 +153,7 @@ def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
 
 
 def test_a_finished_trial_is_labelled_and_not_drawn_again(tmp_path):
-    setting = setting_of(60.0, ENGINE)
+    setting = setting_of(60.0, "mujoco")
     near = dataclasses.replace(DOMAINS["paper"], objects=("box",), targets=((0.6, 0.0), (2.0, 2.0)))
     plan = Plan(near, 2, {"rps": RPSParams.paper()}, setting)
     (take,) = film.of_sweep(tmp_path, plan, ["rps"], "first", (1, 2))
@@ -170,7 +170,7 @@ def test_a_finished_trial_is_labelled_and_not_drawn_again(tmp_path):
 def test_a_film_shows_mode_and_memory_of_the_law(law, tmp_path):
     domain = dataclasses.replace(DOMAINS["paper"], objects=("box",), targets=((-2.0, 0.1),))
     domain = dataclasses.replace(domain, robot=Robot(drive="differential"))
-    plan = Plan(domain, 1, {law: registry.LAWS[law]}, setting_of(60.0, ENGINE))
+    plan = Plan(domain, 1, {law: registry.LAWS[law]}, setting_of(60.0, "mujoco"))
     (take,) = film.of_sweep(tmp_path, plan, [law], "first", (1, 1))
     shots = [shot for _, (shot,) in islice(film._shots(take, plan.setting, 50), 40)]
     assert np.isnan(shots[0].remembered).all()
@@ -194,7 +194,7 @@ def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
         return peak_bytes
 
     peak(1)
-    assert peak(60) < peak(3) + 320 * 180 * 3 * 10  # ten pictures
+    assert peak(30) < peak(3) + 320 * 180 * 3 * 10  # ten pictures
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def step_backwards(params, state, obs):
 @pytest.mark.usefixtures("registries")
 def test_the_command_plots_each_mode_and_prints_a_replay_command(tmp_path, capsys):
     run = tmp_path / "run"
-    brief = setting_of(30.0)
+    brief = setting_of(10.0, "mujoco")
     rps_jax.register_law("backwards", Law(lambda params: (), step_backwards), Backwards())
     drums = parse_domain("wide,objects=random_cylinder,bearing=-0.5:0.5,gap=0.05:0.06")
     laws = {"mine law": "backwards"}
@@ -124,7 +124,7 @@ def test_the_command_plots_each_mode_and_prints_a_replay_command(tmp_path, capsy
     assert "never touched: 3 of 3" in text
     assert f"rps replay {run} 0 --law 'mine law'`" in text
     for world in (0, 1):
-        row = rf"\| {world} +\| 30 s +\| untouched +\| 1.5 m +\|"
+        row = rf"\| {world} +\| 10 s +\| untouched +\| 0.5 m +\|"
         assert re.search(rf"^{row}$", text, re.MULTILINE)
     picture = run / "gallery" / "never_touched.png"
     assert picture.stat().st_size > 10_000

@@ -133,9 +133,13 @@ PAIRS = [
 
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)
 def test_a_control_step_is_the_processors(shape, skin, tmp_path):
-    """This holds for any combination of worlds in a warp. Wheels slip, by axis."""
-    slips = {"robot_slip_sideways": Range(0, 0.3), "robot_slip_yaw": Range(0, 0.5)}
-    stage, inputs, loop, pushing = build_push(shape, skin, **slips)
+    """This holds for any combination of worlds in a warp. Wheels slip, by axis.
+
+    Bases have a limited force and objects have feet.
+    """
+    drawn = {"robot_slip_sideways": Range(0, 0.3), "robot_slip_yaw": Range(0, 0.5)}
+    drawn |= {"domain": "real", "feet": Range(0.3, 1.0)}
+    stage, inputs, loop, pushing = build_push(shape, skin, **drawn)
 
     def world_step(world, params, state):
         return trial.control_step(stage, world, params, state, loop, lambda f, *_: f)[0]
@@ -148,6 +152,7 @@ def test_a_control_step_is_the_processors(shape, skin, tmp_path):
     same(computed, run(*inputs, pushing, order=np.roll(np.arange(21)[::-1], 5)))
 
 
+@pytest.mark.slow
 def test_a_control_period_is_the_processors(tmp_path):
     """Bases have a limited force and objects have feet; the contact force is compared."""
     stage, (worlds, _), loop, trials = build_push("prism", domain="real", feet=Range(0.3, 1.0))

@@ -36,6 +36,14 @@ def make_vector(**options):
     return gymnasium.make_vec("rps_jax/Push-v0", num_envs=COUNT, **HOW | options)
 
 
+def with_programs_of(compiled, envs):
+    """Return environments with the compiled programs of others."""
+    mine, theirs = (getattr(x.unwrapped, "_vector", x.unwrapped) for x in (envs, compiled))
+    for name in ("_start", "_act", "_select"):
+        setattr(mine, name, getattr(theirs, name))
+    return envs
+
+
 @pytest.fixture(scope="module")
 def single():
     return gymnasium.make("rps_jax/Push-v0", **HOW)
@@ -114,9 +122,7 @@ def test_a_success_terminates_and_resets_in_the_next_step(vector):
 
 def test_autoreset_in_the_same_step_is_optional(vector):
     _, rewards, ended, *_ = step_until_success(vector)
-    envs = make_vector(autoreset_mode="SameStep")
-    for name in ("_start", "_act", "_select"):  # whose programs are compiled
-        setattr(envs.unwrapped, name, getattr(vector.unwrapped, name))
+    envs = with_programs_of(vector, make_vector(autoreset_mode="SameStep"))
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     obs, same, terminated, _, infos = step_until_success(envs)
     assert_array_equal(terminated, ended)
@@ -142,7 +148,7 @@ def test_images_are_rendered_on_request(single):
     single.reset(seed=0)
     assert single.unwrapped.render() is None
     drawn = gymnasium.make("rps_jax/Push-v0", render_mode="rgb_array", **HOW)
-    drawn.reset(seed=0)
+    with_programs_of(single, drawn).reset(seed=0)
     image = drawn.render()
     assert image.shape == (240, 320, 3)
     assert image.std() > 10
@@ -240,9 +246,7 @@ def test_a_mask_restarts_some_worlds(vector):
 
 
 def test_a_mask_restarts_ended_worlds_without_autoreset(vector):
-    envs = make_vector(autoreset_mode="Disabled")
-    for name in ("_start", "_act", "_select"):  # whose programs are compiled
-        setattr(envs.unwrapped, name, getattr(vector.unwrapped, name))
+    envs = with_programs_of(vector, make_vector(autoreset_mode="Disabled"))
     _, _, ended, *_ = step_until_success(envs)
     with refusing(rf"worlds \[{np.flatnonzero(ended)[0]}.* have ended"):
         envs.step(AHEAD)
@@ -306,10 +310,10 @@ def test_checks_that_a_user_asks_of_jax_do_not_stop_it(vector, option, value):
 
 
 @pytest.mark.parametrize("kind", [gymnasium.make, slow(gymnasium.make_vec)])
-def test_a_film_is_recorded(kind, tmp_path):
+def test_a_film_is_recorded(kind, single, tmp_path):
     pytest.importorskip("moviepy")
     wrappers = gymnasium.wrappers if kind is gymnasium.make else gymnasium.wrappers.vector
-    env = kind("rps_jax/Push-v0", render_mode="rgb_array", **HOW)
+    env = with_programs_of(single, kind("rps_jax/Push-v0", render_mode="rgb_array", **HOW))
     env = wrappers.RecordVideo(env, str(tmp_path), episode_trigger=lambda _: True, video_length=2)
     env.reset(seed=0)
     for _ in range(3):

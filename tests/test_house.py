@@ -4,13 +4,12 @@ import inspect
 import os
 import pkgutil
 import re
-import sys
 import tomllib
 from importlib import import_module
 
 import jax
 import pytest
-from helpers import ROOT, addresses, inner_names, output_of, printed, rps
+from helpers import ROOT, addresses, inner_names, printed, rps
 
 import rps_jax
 
@@ -172,10 +171,11 @@ def extensions(tmp_path_factory):
     return folder
 
 
-def test_examples_of_extensions_work_from_python(extensions):
+def test_examples_of_extensions_work_from_python(extensions, registries, monkeypatch, capsys):
     """A law, an engine, a quantity and a task are used together, in sweeps and in points."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    text = output_of(sys.executable, "-c", EVERYWHERE, cwd=extensions, env=environment)
+    monkeypatch.syspath_prepend(extensions)
+    exec(EVERYWHERE, {})
+    text = capsys.readouterr().out
     assert text.startswith(str(PACKAGE))
     assert "domain threshold (low) = 0.01 is not allowed: it must be a number and at least" in text
     assert "did you mean 'threshold'?" in text

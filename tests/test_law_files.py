@@ -90,12 +90,12 @@ def step(params, state, obs):
 
 def test_the_commands_warn_that_the_law_returned_nan(tmp_path, capsys):
     path = write_law(tmp_path, "v_y = jnp.inf * details.distance")
-    brief = "--engine mujoco --horizon 0.2"
+    brief = "--domain wide,objects=box --engine mujoco --horizon 0.2"
     with pytest.warns(UserWarning, match="a law returned NaN"):
         assert rps(f"sweep --worlds 2 --laws {path} {brief} --out", tmp_path / "s") == 0
     assert "| mine | 2 of 2" in capsys.readouterr().out
     with pytest.warns(UserWarning, match="a law returned NaN"):
-        evaluate(registry.LAWS["mine"], worlds=2, setting=BRIEF)
+        evaluate(registry.LAWS["mine"], "wide,objects=box", worlds=2, setting=BRIEF)
 
 
 NAN = {

@@ -397,7 +397,7 @@ TINY = {
     "minutes": 0,
     "drawn": 6,
     "validation": 3,
-    "setting": Setting("quasistatic", fidelity="fast", rules=Rules(horizon=4.0, max_lost=30.0)),
+    "setting": Setting("fused", fidelity="fast", rules=Rules(horizon=4.0, max_lost=30.0)),
 }
 
 
@@ -577,7 +577,7 @@ def test_the_ladder_runs_the_policy_of_the_command(learned, tmp_path, capsys, re
     values = {name: value for name, value in TINY.items() if name != "setting"}
     options = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in values.items())
     drums = "wide,objects=random_cylinder,distance=0.7:0.8,bearing=-0.5:0.5,gap=0:0.01"
-    setting = f"--domain {drums} --engine quasistatic --fidelity fast --horizon 4"
+    setting = f"--domain {drums} --engine fused --fidelity fast --horizon 4"
     output = printed(capsys, f"learn {setting} --max-lost 30 {options} --updates 4 --out", out)
     assert "Compile" in output
     assert (out / "curve.png").stat().st_size > 10_000

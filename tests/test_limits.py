@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 from helpers import PAPER, refusals, results_of
 from numpy.random import default_rng
 from numpy.testing import assert_array_equal
@@ -58,6 +59,7 @@ def test_every_robot_meets_the_worlds_of_the_ideal_one(monkeypatch):
     assert_array_equal(results["lag"].world, np.arange(3))
 
 
+@pytest.mark.slow
 def test_a_bounded_acceleration_makes_ramps_of_the_laws_turns():
     robot = Robot(acceleration_max=(1.0, 0.2))
     turns = limits.turning({"slow": robot}, PAPER, 4.0).sel(robot="slow")

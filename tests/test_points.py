@@ -151,7 +151,7 @@ def test_the_command_sweeps_points_and_can_be_continued(tmp_path, capsys):
     domain, file = tmp_path / "both.json", tmp_path / "some.nc"
     domain.write_text(json.dumps(asdict(BOTH)))
     files.write_results(file, points.worlds_at(BOTH, some_points()))
-    words = f"sweep --laws rps --engine quasistatic --fidelity fast --horizon 5 --slots {SLOTS}"
+    words = f"sweep --laws rps --engine mujoco --horizon 1 --slots {SLOTS}"
     command = [*words.split(), "--part", 2, "--domain", domain, "--points", file]
     command += ["--out", tmp_path / "r"]
     assert rps(*command) == 0

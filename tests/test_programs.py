@@ -68,7 +68,7 @@ def test_a_recorded_trial_is_traced_once_for_all_processes(cache, monkeypatch):
     """A cached trial returns the same named tuples as a traced one."""
     traced, advance = [], trial.advance
     monkeypatch.setattr(trial, "advance", lambda *a: traced.append(1) or advance(*a))
-    setting = setting_of(0.2)
+    setting = setting_of(0.2, "fused")
     worlds = pushes.build([Case("box")], setting)
     first, again = (pushes.record_batch(worlds, setting)[0] for _ in range(2))
     assert len(traced) == 1

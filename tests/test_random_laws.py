@@ -17,7 +17,7 @@ from rps_jax.engines import native
 
 pytestmark = pytest.mark.skipif(native.target() is None, reason="there is no C compiler")
 SEEDS = 20  # of one compilation
-FEW = 7  # in all runs of the tests
+FEW = 3  # in all runs of the tests
 COUNT = 4  # numbers of a vector
 SPECIAL = [0.0, -0.0, np.nan, np.inf, -np.inf]
 BOUNDS = [2**31 - 1, -(2**31), -1, 0, 31, 32]

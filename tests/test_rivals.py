@@ -347,7 +347,7 @@ def twist_of(name, touch, p_object, force=(-20.0, 5.0)):
     return np.asarray(second_twist(law, params, observation))
 
 
-@pytest.mark.parametrize("name", RIVALS)
+@pytest.mark.parametrize("name", [slow(x) if x.startswith("path_pose") else x for x in RIVALS])
 def test_a_law_is_symmetric_and_does_not_depend_on_the_frame(name):
     rng, flip = default_rng(3), np.array([1.0, -1.0])
     for _ in range(8):
@@ -397,7 +397,7 @@ def test_a_law_refuses_invalid_parameters_and_restores_valid_ones(name):
 @pytest.mark.parametrize(
     "name",
     [
-        x if x in ("force_push", "pursuit") else slow(x)
+        x if x == "pursuit" else slow(x)
         for x in sorted(RIVALS.keys() - {"force_push_published", "learned_mlp"})
     ],
 )

@@ -159,8 +159,7 @@ def test_a_base_turns_and_strafes_less_than_commanded_in_all_engines(engine):
 
 def test_the_environment_and_a_single_trial_turn_by_the_share_that_is_left():
     drums = replace(NEAR, objects=("random_cylinder",), robot=Robot(slip_yaw=0.45))
-    setting = Setting("quasistatic", SHORT.physics, rules=Rules(horizon=20.0))
-    push = PushEnv("random_cylinder", drums, setting=setting, worlds=2)
+    push = PushEnv("random_cylinder", drums, setting=SHORT, worlds=2)
     state = jax.jit(push.reset)(jax.random.key(0))
     step = jax.jit(push.step)
     for _ in range(5):
@@ -168,7 +167,7 @@ def test_the_environment_and_a_single_trial_turn_by_the_share_that_is_left():
     turn = 0.55 * 0.15 * 5 * push.dt
     assert_allclose(state.data.qpos[2], turn, rtol=1e-4)
     assert_allclose(state.data.qpos[1], 0.5 * 0.05 * 5 * push.dt, rtol=1e-3)
-    trace = rps_jax.push("box", target=(0.6, 0.3), setting=setting, robot="ideal,slip_yaw=0.45")
+    trace = rps_jax.push("box", target=(0.6, 0.3), setting=SHORT, robot="ideal,slip_yaw=0.45")
     steady = (trace.data.omega.values == np.float32(0.15))[:-1] & (np.diff(trace.data.omega) == 0)
     turned = np.diff(trace.data.qpos.values[:, 2])[steady]  # in 0.1 s
     assert steady.sum() > 20

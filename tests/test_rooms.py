@@ -365,17 +365,15 @@ SETTING = setting_of(40.0)
 
 def test_a_trial_ends_at_a_wall_and_a_wide_door_lets_it_pass(tmp_path):
     wide = files.write_json(tmp_path / "map.json", HALL | {"polygons": DOOR, "object_radius": 0.15})
-    trace = rps_jax.push("cylinder", task=f"rooms,{wide}", skin="ideal", setting=SETTING)
-    assert trace.data.outcome_wall_touch == 0
-    assert 0.1 < trace.data.outcome_clearance < 0.6
-    assert trace.data.walls.shape == (16, 2, 2)
     low = [[3.2, 0], [3.3, 0], [3.3, 2.5], [3.2, 2.5]]
     far = [[8.5, 3.5], [8.6, 3.5], [8.6, 3.6], [8.5, 3.6]]  # for equal numbers of walls
     task = HALL | {"polygons": [low, far], "base_radius": 0.3, "object_radius": 0}
-    touched = rps_jax.push("cylinder", task=task, skin="ideal", setting=SETTING)
-    assert touched.data.outcome_wall_touch > 0
-    assert not touched.outcome.success
-    point = Point(touched.data.outcome_touch_x + 1.5, touched.data.outcome_touch_y + 2)
+    cases = [Case("cylinder", task=x, skin="ideal") for x in (f"rooms,{wide}", task)]
+    outcome, _ = pushes.run(cases, SETTING)
+    assert (outcome.task["wall_touch"] > 0).tolist() == [False, True]
+    assert 0.1 < outcome.task["clearance"][0] < 0.6
+    assert not outcome.success[1]
+    point = Point(outcome.task["touch_x"][1] + 1.5, outcome.task["touch_y"][1] + 2)
     assert Polygon(low).boundary.distance(point) < 1e-5
 
 

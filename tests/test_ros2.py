@@ -170,7 +170,14 @@ def test_cpp_and_python_agree_on_a_recorded_bag(goal, binary, tmp_path, python):
     """On the way to a target, and along a path, which they follow as the task does."""
     pytest.importorskip("mcap_ros2")
     path, (seconds, name, options) = tmp_path / "push.mcap", PUSHES[goal]
-    push(name, law="rps_plus", skin="capacitive", bag=path, setting=setting_of(seconds), **options)
+    push(
+        name,
+        law="rps_plus",
+        skin="capacitive",
+        bag=path,
+        setting=setting_of(seconds, "mujoco"),
+        **options,
+    )
     read = bag.read(path)
     messages = []
     for i, time in enumerate(read["time"]):

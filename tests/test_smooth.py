@@ -494,16 +494,15 @@ def test_a_smooth_rps_plus_can_be_differentiated_by_its_own_parameters():
     law, names = registry.smooth_law(rps_plus.LAW), ("d_near", "press", "n_lost", "ahead", "aside")
     start = RPSPlusParams(n_lost=2.0)
     with jax.enable_x64(True):
+        moments = jax.tree.map(lambda *x: jnp.stack(x), *[x for *_, x in plus_moments(10)])
 
         @jax.jit
         def driven(values):
             params = start._replace(**dict(zip(names, values, strict=True)))
-            state, total = law.init(params), 0.0
-            for is_start, _, weight in plus_moments(10):
-                state = law.init(params) if is_start else state
-                state, twist, _ = law.step(params, state, weight)
-                total = total + twist.v_x + 0.7 * twist.v_y + 0.1 * twist.omega
-            return total
+            first = jax.tree.map(lambda x: jnp.asarray(x, float), law.init(params))
+            step = lambda state, obs: law.step(params, state, obs)[:2]  # noqa: E731
+            twist = jax.lax.scan(step, first, moments)[1]
+            return jnp.sum(twist.v_x + 0.7 * twist.v_y + 0.1 * twist.omega)
 
         base = jnp.array([getattr(start, name) for name in names], float)
         slope, steps = jax.grad(driven)(base), 1e-5 * jnp.eye(len(names))

@@ -161,7 +161,7 @@ def integrals():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(quasistatic, "_LEAST_RADIUS", 1e-3)
         for kind in KINDS:
-            at, share = distribution("box", kind, {"even": 18, "rim": 30}[kind])
+            at, share = distribution("box", kind, {"even": 18, "rim": 36}[kind])  # 144 points
             inputs, qpos = inputs_of("box", "corners")
             box = inputs.solids
             feet = np.column_stack([at, share])[None]
@@ -204,7 +204,7 @@ def turn_on(tmp_path, registries):
 @pytest.mark.parametrize("engine", ["fused", "mujoco", "quasistatic"])
 def test_an_object_is_registered_on_the_pads_of_a_fit(engine, turn_on, integrals):
     """Pads of even pressure turn it as the integral over the pressure."""
-    pads = finger.uniform_pads(OUTLINES["box"][0], 14)
+    pads = finger.uniform_pads(OUTLINES["box"][0], 12)
     feet = np.insert(pads, 3, 1.0, axis=1)
     assert len(feet) > solid.SIDES
     assert turn_on(engine, feet) == pytest.approx(integrals["even"], rel=0.03)

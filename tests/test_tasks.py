@@ -21,7 +21,6 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.runs.push import Push
 from rps_jax.spec import Spec
-from rps_jax.trials.trial import Rules
 from rps_jax.world import draws, tasks
 from rps_jax.world.domain import Range, parse_domain
 from rps_jax.world.tasks import corridor, path
@@ -239,7 +238,7 @@ def test_walls_change_nothing_until_they_are_touched():
 
 def test_a_trial_ends_at_the_first_touch_of_the_exact_outlines():
     task = "corridor,width=0.62,turns=1,turn_angle=1.2,lookahead=1.2"
-    trace = rps_jax.push("box", task=task, skin="ideal", setting=replace(BRIEF, rules=Rules(90.0)))
+    trace = rps_jax.push("box", task=task, skin="ideal", setting=setting_of(90.0, "mujoco"))
     data, world = trace.data, trace.world
     walls = [LineString(x) for x in data.walls.values]
     half = float(data.half_length), float(data.half_width)
@@ -291,7 +290,7 @@ class Timed(Task):
 def test_a_task_is_one_declaration(registries):
     rps_jax.register_task(Timed)
     domain = replace(parse_domain("wide,objects=random_cylinder"), task=Timed())
-    results = rps_jax.sweep("rps", domain, worlds=3, setting=BRIEF)
+    results = rps_jax.sweep("rps", domain, worlds=3, setting=setting_of(1.0, "mujoco"))
     assert results["count"].values.tolist() == [[10, 10, 10]]
     assert not results.success.any()
     assert results["count"].attrs["long_name"] == "control steps"

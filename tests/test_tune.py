@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import PAPER, read_curve, refusal, refusing
+from helpers import PAPER, read_curve, refusal, refusing, slow
 from helpers import rps as command
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -301,7 +301,7 @@ def pretended(monkeypatch):
     return calls
 
 
-@pytest.mark.parametrize(("tuner", "killed"), [(evolution, (4,)), (descents, (1,))])
+@pytest.mark.parametrize(("tuner", "killed"), [(evolution, (4,)), slow(descents, (1,))])
 def test_a_continued_run_is_the_uninterrupted_one(tmp_path, pretended, tuner, killed):
     whole = tuned(tmp_path / "whole", tuner())
     for done in killed:
@@ -315,7 +315,7 @@ def test_a_continued_run_is_the_uninterrupted_one(tmp_path, pretended, tuner, ki
     assert len(read_curve(tmp_path / "whole")) == 6
 
 
-@pytest.mark.parametrize("tuner", [evolution, descents])
+@pytest.mark.parametrize("tuner", [slow(evolution), descents])
 def test_only_a_damaged_generation_is_repeated(tmp_path, pretended, tuner):
     whole = tuned(tmp_path, tuner())
     curve = (tmp_path / "curve.csv").read_text()
@@ -401,7 +401,7 @@ def test_the_report_of_a_descent_tells_its_times_and_parameters(pretended):
 
 
 def test_the_command_line(tmp_path, capsys):
-    words = "tune es --engine quasistatic --objects random_cylinder --worlds 2 --validation 2"
+    words = "tune es --engine fused --objects random_cylinder --worlds 2 --validation 2"
     words += " --population 4 --generations 2 --horizon 8 --tuned L K_h --slots 8 --out"
     calls = [*words.split(), tmp_path / "run"]
     assert command(*calls) == 0

@@ -22,6 +22,7 @@ from helpers import (
     refusal,
     refusing,
     setting_of,
+    slow,
     still,
 )
 from numpy.testing import assert_allclose, assert_array_equal
@@ -66,7 +67,7 @@ def p_robot_object(snapshot):
 
 
 @pytest.mark.parametrize(
-    "law", ["rps,K_h=0.3", "rps,tuned.json", "mine.py:PParams,v=0.04", "policy.npz"]
+    "law", ["rps,K_h=0.3", "rps,tuned.json", "mine.py:PParams,v=0.04", slow("policy.npz")]
 )
 def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries):
     """Laws are given by name with changes, as tuned parameters, as a user's file, or learned."""
@@ -74,8 +75,7 @@ def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries)
     (tmp_path / "tuned.json").write_text(json.dumps({"L": 0.3, "saturate_first": 1}))
     shutil.copy(ROOT / "notebooks" / "examples" / "custom_law.py", tmp_path / "mine.py")
     shutil.copy(Path(learned.__file__).parent / "learned_small.npz", tmp_path / "policy.npz")
-    setting = replace(SETTING, engine="quasistatic")
-    shown = viewer.View("cylinder", target=(0.6, 0.0), law=law, setting=setting)
+    shown = viewer.View("cylinder", target=(0.6, 0.0), law=law, setting=SETTING)
     shown.validate()
     push = shown.push()
     push.live.step(25)
@@ -182,7 +182,7 @@ FLAGS = (
     "--disable-sync",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-    "--window-size=800,640",
+    "--window-size=640,480",
 )
 SHOWN = viewer.View("cylinder", target=(0.0, 2.0), setting=replace(SETTING, rules=Rules()))
 

@@ -280,7 +280,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
       ('time',)
     """
 
-    quick: bool = option(False, kw_only=True, hidden=True)
+    quick: bool = option(False, hidden=True, kw_only=True)
 
     def __post_init__(self) -> None:
         """Defer the checks of `Case` to `check`."""

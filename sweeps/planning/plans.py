@@ -190,18 +190,10 @@ def _levenberg(
     linearised errors. A push without progress starts again nearby.
     """
     errors, jacobian = derivatives(theta)
-    damping, count, eye = np.ones(len(theta)), rollouts, np.eye(3)
-    random = np.random.default_rng(0)
+    damping, count, random = np.ones(len(theta)), rollouts, np.random.default_rng(0)
     while True:
         yield theta, errors, count
-        j = np.nan_to_num(jacobian.astype(float), posinf=0.0, neginf=0.0)
-        gram = np.einsum("nik,njk->nij", j, j)
-        shift = 1e-3 + 0.01 * damping * np.trace(gram, axis1=1, axis2=2) / 3
-        weights = np.linalg.solve(gram + shift[:, None, None] * eye, errors[..., None])
-        step = -np.einsum("nik,ni->nk", j, weights[..., 0]).reshape(theta.shape)
-        step *= np.minimum(1, _STEP / np.maximum(np.abs(step).max(axis=(1, 2)), _STEP))[
-            :, None, None
-        ]
+        step = _shortest_step(errors, jacobian, damping).reshape(theta.shape)
         stuck = (damping > _STUCK) & ~solved(errors)
         restart = theta + 0.3 * random.normal(size=theta.shape)
         trial = np.clip(np.where(stuck[:, None, None], restart, theta + step), -_FAR, _FAR)
@@ -210,8 +202,23 @@ def _levenberg(
         theta = np.where(better[:, None, None], trial, theta)
         errors = np.where(better[:, None], next_errors, errors)
         jacobian = np.where(better[:, None, None], next_jacobian, jacobian)
-        damping = np.where(stuck, 1.0, np.clip(damping * np.where(better, 0.2, 8), 1e-6, 1e9))
+        damping = _next_damping(damping, stuck, better)
         count += rollouts
+
+
+def _shortest_step(errors: np.ndarray, jacobian: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Return the shortest steps (n, KNOTS * 3) that remove the linearised errors."""
+    j = np.nan_to_num(jacobian.astype(float), posinf=0.0, neginf=0.0)
+    gram = np.einsum("nik,njk->nij", j, j)
+    shift = 1e-3 + 0.01 * damping * np.trace(gram, axis1=1, axis2=2) / 3
+    weights = np.linalg.solve(gram + shift[:, None, None] * np.eye(3), errors[..., None])
+    step = -np.einsum("nik,ni->nk", j, weights[..., 0])
+    largest = np.abs(step).max(axis=1, keepdims=True)
+    return step * np.minimum(1, _STEP / np.maximum(largest, _STEP))
+
+
+def _next_damping(damping: np.ndarray, stuck: np.ndarray, better: np.ndarray) -> np.ndarray:
+    return np.where(stuck, 1.0, np.clip(damping * np.where(better, 0.2, 8), 1e-6, 1e9))
 
 
 @_best

@@ -551,9 +551,48 @@ _DRIVE = PoseParams(  # tuned in `wide` with boxes and a differential base
 PRESETS = {
     "pose": PoseParams(),
     "pose_drive": _DRIVE,  # for bases that cannot move sideways
-    # The same with a narrow front, as 0.3 m of `turtlebot4`.
-    "pose_narrow": _DRIVE._replace(l_edge=0.13, l_turn=0.14, gap=0.15, beyond=0.03),
+    # The same with a front of 0.36 to 0.52 m: tuned in `wide` with boxes and `jackal`.
+    "pose_medium": _DRIVE._replace(
+        r=0.238,
+        s_min=1.837,
+        s_flush=0.2764,
+        s_back=0.4071,
+        y_tol=0.02423,
+        cap=0.01608,
+        y_miss=0.05899,
+        K_h=0.2278,
+        h_max=0.4703,
+        omega_push=0.005412,
+        l_edge=0.2404,
+        l_turn=0.128,
+        back=0.02862,
+        R=0.9323,
+        gap=0.5199,
+        beyond=0.06,
+        tau=0.2838,
+    ),
+    # The same with a narrower front: tuned in `wide` with boxes and `turtlebot4`.
+    "pose_narrow": _DRIVE._replace(
+        r=0.2526,
+        s_min=1.453,
+        s_flush=0.8082,
+        s_back=0.4195,
+        y_tol=0.05361,
+        cap=0.06263,
+        y_miss=0.07793,
+        K_h=1.582,
+        h_max=0.5253,
+        omega_push=0.01411,
+        l_edge=0.1395,
+        l_turn=0.112,
+        back=0.553,
+        R=0.4382,
+        gap=0.2347,
+        beyond=0.09194,
+        tau=0.03871,
+    ),
 }
+_HALF_FRONTS = {"pose_drive": 0.26, "pose_medium": 0.18, "pose_narrow": 0.0}  # [m] from which on
 
 
 def preset_of(robot: Robot) -> str | None:
@@ -562,5 +601,4 @@ def preset_of(robot: Robot) -> str | None:
         return None
     if robot.drive == "omni":
         return "pose"
-    # A contact that is off by l_edge must still be on the front.
-    return "pose_drive" if robot.half_width > _DRIVE.l_edge else "pose_narrow"
+    return next(name for name, half in _HALF_FRONTS.items() if robot.half_width >= half)
