@@ -112,8 +112,8 @@ def contacts_ahead(body, qpos):
     """Return the contacts of objects at rest with the side of a base that heads along x."""
     still = jnp.zeros((len(qpos), 9))
     state = fused.from_mujoco(body, Motion(qpos, still, still))
-    ahead = jnp.ones(1), jnp.zeros(1)
-    return contacts.side_contacts(fused.split_entries(body), state, vectors.matrix(state.q), ahead)
+    inputs = fused.split_entries(body), state, vectors.matrix(state.q)
+    return contacts.side_contacts(*inputs, (jnp.ones(1), jnp.zeros(1)))
 
 
 @pytest.mark.parametrize("name", ["box", "cylinder"])

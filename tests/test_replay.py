@@ -76,11 +76,10 @@ SLOW_CASES = {
 }
 
 
-SLOW = [slow(x) for x in SLOW_CASES.values()]
-
-
 @pytest.mark.parity  # of a trial in C, and of a law in XLA
-@pytest.mark.parametrize("case", [*CASES.values(), *SLOW], ids=[*CASES, *SLOW_CASES])
+@pytest.mark.parametrize(
+    "case", [*CASES.values(), *map(slow, SLOW_CASES.values())], ids=[*CASES, *SLOW_CASES]
+)
 def test_a_replay_has_the_bits_of_its_sweep(case, tmp_path):
     results = sweep(tmp_path, *case)
     with warnings.catch_warnings(action="error"):
