@@ -110,7 +110,7 @@ def test_a_contacts_force_and_stiffness_are_derivatives_of_its_cost(cone):
 @jitted
 def contacts_ahead(body, qpos):
     """Return the contacts of objects at rest with the side of a base that heads along x."""
-    still = jnp.zeros((len(qpos), 9))
+    still = jnp.zeros((1, 9))
     state = fused.from_mujoco(body, Motion(qpos, still, still))
     inputs = fused.split_entries(body), state, vectors.matrix(state.q)
     return contacts.side_contacts(*inputs, (jnp.ones(1), jnp.zeros(1)))

@@ -23,10 +23,9 @@ WORLDS = 5
 SLOTS = 3  # two batches, and a number that only the record of the run has
 
 
-def sweep(folder, law, domain, task="reach", engine="fused", horizon=4.0, **options):
-    setting = setting_of(horizon, engine)
-    names = {"task": task, "setting": setting, "worlds": WORLDS, "slots": SLOTS}
-    return rps_jax.sweep(law, domain, out=folder, **names | options)
+def sweep(folder, law, domain, task="reach", engine="fused", horizon=4.0):
+    options = {"setting": setting_of(horizon, engine), "worlds": WORLDS, "slots": SLOTS}
+    return rps_jax.sweep(law, domain, task=task, out=folder, **options)
 
 
 def assert_equal_bits(outcomes, results):
@@ -45,7 +44,7 @@ def replayed(run, law):
 
 CASES = {
     "a law in C, in hostile worlds": ("rps_plus", "hostile,objects=random_prism"),
-    "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
+    "an engine outside of JAX": ("rps", "paper,objects=cylinder", "reach", "mujoco", 1.0),
 }
 HALL = {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]], "start": [1.5, 3, 0], "goal": [7, 3]}
 TASKS = {
@@ -65,6 +64,7 @@ SLOW_CASES = {
         "real,objects=random_cylinder",
         TASKS["corridor"],
     ),
+    "C MuJoCo": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
     "MJX": ("rps", "wide,objects=random_box", "reach", "mjx", 1.0),
     "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),
     **{
