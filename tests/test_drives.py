@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ROOT, observation, refusals, refusing, slow
+from helpers import ROOT, observation, refusals, refusing, row, slow
 
 from rps_jax import draw_worlds, engines, rollout
 from rps_jax.app.cli import flags, names
@@ -446,10 +446,9 @@ def test_calls_of_the_library_take_the_period_of_the_robot():
     assert env.dt == 0.1
     inputs = {"robot": "ideal,period=0.1", "setting": Setting("quasistatic")}
     batch = draw_worlds("wide,objects=random_cylinder", **inputs)
-    world = jax.tree.map(lambda x: x[0], batch.worlds)
     options = registry.LAWS["rps"], batch.stage, inputs["setting"]
     run = lambda world: rollout(world, *options, horizon=0.5)  # noqa: E731
-    assert jax.eval_shape(run, world).time.shape == (5,)
+    assert jax.eval_shape(run, row(batch.worlds, 0)).time.shape == (5,)
 
 
 def test_models_and_checks_keep_the_period_and_the_support_of_a_run():
