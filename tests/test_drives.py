@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ROOT, observation, refusals, refusing, slow
+from helpers import ROOT, observation, refusals, refusing, row, slow
 
 from rps_jax import draw_worlds, engines, rollout
 from rps_jax.app.cli import flags, names
@@ -444,10 +444,11 @@ def test_another_period_than_that_of_the_robot_is_refused():
 def test_calls_of_the_library_take_the_period_of_the_robot():
     env = PushEnv(robot="ideal,period=0.1", worlds=2)
     assert env.dt == 0.1
-    batch = draw_worlds("wide,objects=random_cylinder", robot="ideal,period=0.1")
-    world = jax.tree.map(lambda x: x[0], batch.worlds)
-    law = registry.LAWS["rps"]
-    assert rollout(world, law, batch.stage, horizon=0.5).time.shape == (5,)
+    inputs = {"robot": "ideal,period=0.1", "setting": Setting("quasistatic")}
+    batch = draw_worlds("wide,objects=random_cylinder", **inputs)
+    options = registry.LAWS["rps"], batch.stage, inputs["setting"]
+    run = lambda world: rollout(world, *options, horizon=0.5)  # noqa: E731
+    assert jax.eval_shape(run, row(batch.worlds, 0)).time.shape == (5,)
 
 
 def test_models_and_checks_keep_the_period_and_the_support_of_a_run():

@@ -99,9 +99,9 @@ def test_no_command_meets_the_worlds_of_a_tuner(monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(draws, "numbers", partial(stopped, rest))
             for name in sorted(seeded - TUNERS - SEARCHES):
-                law = {"law": "rps"} if name == "score" else {}
+                options = {"score": {"law": "rps"}, "view": {}}.get(name, {"quick": True})
                 with pytest.raises(StoppedError):
-                    commands[name](setting=setting, **law)()
+                    commands[name](setting=setting, **options)()
         rest.add(replace(setting, split="test").world_seed)  # in which tuners test their result
     assert not tuned & validated
     assert not (tuned | validated) & rest

@@ -107,6 +107,15 @@ def test_a_contacts_force_and_stiffness_are_derivatives_of_its_cost(cone):
     assert len(set(zip(force[0] == 0, np.linalg.matrix_rank(full) == 3, strict=True))) > 1
 
 
+@jitted
+def contacts_ahead(body, qpos):
+    """Return the contacts of objects at rest with the side of a base that heads along x."""
+    still = jnp.zeros((1, 9))
+    state = fused.from_mujoco(body, Motion(qpos, still, still))
+    inputs = fused.split_entries(body), state, vectors.matrix(state.q)
+    return contacts.side_contacts(*inputs, (jnp.ones(1), jnp.zeros(1)))
+
+
 @pytest.mark.parametrize("name", ["box", "cylinder"])
 @pytest.mark.parametrize("degrees", [0, 5, 10, 20, 40])
 def test_the_contact_of_a_leaning_object_is_at_its_lower_edge(name, degrees):
@@ -125,14 +134,9 @@ def test_the_contact_of_a_leaning_object_is_at_its_lower_edge(name, degrees):
     base, object_ = (loaded.physics.geom(g).id for g in ("base", "object"))
     true = mujoco.mj_geomDistance(loaded.physics, data, base, object_, 1.0, None)
     body = body_of(loaded.physics, np.asarray(loaded.footprint.vertices))
-    body = jax.tree.map(lambda leaf: jnp.asarray(leaf, float)[None], body)
-    still = jnp.zeros((1, 9))
-    state = fused.from_mujoco(body, Motion(jnp.asarray(qpos, float)[None], still, still))
-    ahead = jnp.ones(1), jnp.zeros(1)
-    contact = contacts.side_contacts(
-        fused.split_entries(body), state, vectors.matrix(state.q), ahead
+    heights, _, _, distances = contacts_ahead(
+        *jax.tree.map(lambda x: np.asarray(x)[None], (body, qpos))
     )
-    heights, _, _, distances = (np.asarray(x) for x in contact)
     corner = z - tall * c + half * s
     assert heights.min() >= max(0.06, corner) - 1e-5
     assert distances.min() == pytest.approx(true, abs=5e-4)

@@ -14,7 +14,6 @@ from helpers import output_of, refusing, row, slow
 from numpy.testing import assert_allclose
 from test_native import OPERATIONS, advanced, build_push, close, same
 
-from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry import vectors
 from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu import GPU_HEADER, GpuWriter
@@ -135,11 +134,13 @@ PAIRS = [
 def test_a_control_step_is_the_processors(shape, skin, tmp_path):
     """This holds for any combination of worlds in a warp. Wheels slip, by axis.
 
-    Bases have a limited force and objects have feet.
+    Bases have a limited force, objects have feet, and the law senses the contact force.
     """
     drawn = {"robot_slip_sideways": Range(0, 0.3), "robot_slip_yaw": Range(0, 0.5)}
-    drawn |= {"domain": "real", "feet": Range(0.3, 1.0)}
+    drawn |= {"domain": "real", "feet": Range(0.3, 1.0), "law": "force_push_published"}
     stage, inputs, loop, pushing = build_push(shape, skin, **drawn)
+    force = np.linalg.norm(pushing.load.wrench[:, :2], axis=1)  # [N]
+    assert np.mean(force > 1) > 0.5
 
     def world_step(world, params, state):
         return trial.control_step(stage, world, params, state, loop, lambda f, *_: f)[0]
@@ -150,25 +151,6 @@ def test_a_control_step_is_the_processors(shape, skin, tmp_path):
     expected = advanced(stage, inputs, pushing, loop, 1)
     close(computed, expected, warm=4e-3, rest=1e-4)
     same(computed, run(*inputs, pushing, order=np.roll(np.arange(21)[::-1], 5)))
-
-
-@pytest.mark.slow
-def test_a_control_period_is_the_processors(tmp_path):
-    """Bases have a limited force and objects have feet; the contact force is compared."""
-    stage, (worlds, _), loop, trials = build_push("prism", domain="real", feet=Range(0.3, 1.0))
-    pushing = trial.motion(trials)
-    twists = trial.Twist(*(np.full(21, x, np.float32) for x in (0.05, 0.01, 0.05)))
-
-    def world_step(fields, motion, twist, robot):
-        return stage.drive(fields, motion, ControlPeriod(twist, loop.physics, robot, True))
-
-    inputs = worlds.fields, pushing, twists, trial.pushing(worlds)
-    run = Emulated(world_step, row(jax.tree.map(jnp.asarray, inputs), 0), tmp_path, 4)
-    computed, expected = run(*inputs), jax.jit(world_step)(*inputs)
-    assert np.mean(np.linalg.norm(expected.force[:, :2], axis=1) > 1) > 0.5  # [N]
-    assert_allclose(computed.force, expected.force, rtol=1e-3, atol=2e-2)
-    assert_allclose(computed.motion.qpos, expected.motion.qpos, rtol=1e-4, atol=1e-5)
-    assert_allclose(computed.motion.qvel, expected.motion.qvel, rtol=1e-3, atol=1e-4)
 
 
 def test_shared_memory_is_bounded(tmp_path):

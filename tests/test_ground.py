@@ -154,13 +154,13 @@ def test_pushes_mirror_balance_and_converge():
     sign = np.array([1, -1, 1, -1])
     target = pushed(solids, height=0.2)
     pose = poses_at_front(solids, 0.1 * sign, 0.3 * sign)
-    coarse, fine = (rigid.push(target, pose, 0.2, steps) for steps in (30, 60))
+    coarse, fine = (rigid.push(target, pose, 0.1, steps) for steps in (15, 30))
     assert_allclose(fine.pose[:, 0] * [1, -1, -1], fine.pose[:, 1], atol=1e-6)
     assert_allclose(fine.pose[:, 2] * [1, -1, -1], fine.pose[:, 3], atol=1e-6)
     assert max(coarse.rounds, fine.rounds) < rigid.ROUNDS
     assert np.abs(coarse.pose[-1] - fine.pose[-1])[:, :2].max() < 1e-3
     assert_allclose(fine.force[5:, :, 0], fine.power[5:], atol=2e-3)
-    softer = rigid.push(target, pose, 0.2, 30, rounding=Rounding(slip=1e-3, depth=1e-5))
+    softer = rigid.push(target, pose, 0.1, 15, rounding=Rounding(slip=1e-3, depth=1e-5))
     assert np.abs(coarse.pose[-1] - softer.pose[-1])[:, :2].max() < 5e-4
 
 

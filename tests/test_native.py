@@ -329,7 +329,7 @@ def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, options, monkeypatc
 def test_the_physics_of_a_learned_law_is_differentiated_natively(monkeypatch):
     """XLA compiles the law alone: it would take very long for a whole control step."""
     monkeypatch.setattr(native, "load", lambda name: True)  # no compiler runs
-    stage, (worlds, params), loop = batch("box", count=2, law="learned_small")
+    stage, (worlds, params), loop = batch("cylinder", count=2, law="learned_small")
     trials = start_trials((worlds, params), loop)
 
     def path_length(params):

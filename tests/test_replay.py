@@ -23,10 +23,9 @@ WORLDS = 5
 SLOTS = 3  # two batches, and a number that only the record of the run has
 
 
-def sweep(folder, law, domain, task="reach", engine="fused", horizon=4.0, **options):
-    setting = setting_of(horizon, engine)
-    names = {"task": task, "setting": setting, "worlds": WORLDS, "slots": SLOTS}
-    return rps_jax.sweep(law, domain, out=folder, **names | options)
+def sweep(folder, law, domain, task="reach", engine="fused", horizon=4.0):
+    options = {"setting": setting_of(horizon, engine), "worlds": WORLDS, "slots": SLOTS}
+    return rps_jax.sweep(law, domain, task=task, out=folder, **options)
 
 
 def assert_equal_bits(outcomes, results):
@@ -45,7 +44,7 @@ def replayed(run, law):
 
 CASES = {
     "a law in C, in hostile worlds": ("rps_plus", "hostile,objects=random_prism"),
-    "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
+    "an engine outside of JAX": ("rps", "paper,objects=cylinder", "reach", "mujoco", 1.0),
 }
 HALL = {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]], "start": [1.5, 3, 0], "goal": [7, 3]}
 TASKS = {
@@ -65,6 +64,7 @@ SLOW_CASES = {
         "real,objects=random_cylinder",
         TASKS["corridor"],
     ),
+    "C MuJoCo": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
     "MJX": ("rps", "wide,objects=random_box", "reach", "mjx", 1.0),
     "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),
     **{
@@ -76,11 +76,10 @@ SLOW_CASES = {
 }
 
 
-SLOW = [slow(x) for x in SLOW_CASES.values()]
-
-
 @pytest.mark.parity  # of a trial in C, and of a law in XLA
-@pytest.mark.parametrize("case", [*CASES.values(), *SLOW], ids=[*CASES, *SLOW_CASES])
+@pytest.mark.parametrize(
+    "case", [*CASES.values(), *map(slow, SLOW_CASES.values())], ids=[*CASES, *SLOW_CASES]
+)
 def test_a_replay_has_the_bits_of_its_sweep(case, tmp_path):
     results = sweep(tmp_path, *case)
     with warnings.catch_warnings(action="error"):

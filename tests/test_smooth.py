@@ -499,9 +499,8 @@ def test_a_smooth_rps_plus_can_be_differentiated_by_its_own_parameters():
         @jax.jit
         def driven(values):
             params = start._replace(**dict(zip(names, values, strict=True)))
-            first = jax.tree.map(lambda x: jnp.asarray(x, float), law.init(params))
             step = lambda state, obs: law.step(params, state, obs)[:2]  # noqa: E731
-            twist = jax.lax.scan(step, first, moments)[1]
+            twist = jax.lax.scan(step, law.init(params), moments)[1]
             return jnp.sum(twist.v_x + 0.7 * twist.v_y + 0.1 * twist.omega)
 
         base = jnp.array([getattr(start, name) for name in names], float)

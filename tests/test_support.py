@@ -212,7 +212,7 @@ def test_an_object_is_registered_on_the_pads_of_a_fit(engine, turn_on, integrals
         turn_on(engine, feet * [1, 1, 1, 1, -1])
 
 
-@pytest.mark.parametrize("engine", ["fused", "mujoco", "quasistatic", slow("mjx")])
+@pytest.mark.parametrize("engine", ["fused", "mujoco", slow("quasistatic"), slow("mjx")])
 def test_weights_and_friction_of_feet_turn_a_cart(engine, turn_on):
     """Castors in front leave the friction to the rear feet."""
     at = solid.rectangles(np.array([0.18]), np.array([0.18]))[0]

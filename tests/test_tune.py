@@ -301,18 +301,17 @@ def pretended(monkeypatch):
     return calls
 
 
-@pytest.mark.parametrize(("tuner", "killed"), [(evolution, (4,)), slow(descents, (1,))])
-def test_a_continued_run_is_the_uninterrupted_one(tmp_path, pretended, tuner, killed):
-    whole = tuned(tmp_path / "whole", tuner())
-    for done in killed:
-        folder = tmp_path / f"{done}"
-        tuned(folder, tuner(done))
-        calls = len(pretended)
-        assert tuned(folder, tuner()) == whole
-        assert len(pretended) - calls == 6 - done  # each generation is one batch
-        for name in ("tuned.json", "curve.csv"):
-            assert (folder / name).read_text() == (tmp_path / "whole" / name).read_text()
-    assert len(read_curve(tmp_path / "whole")) == 6
+@pytest.mark.parametrize(("tuner", "done"), [(evolution, 4), slow(descents, 1)])
+def test_a_continued_run_is_the_uninterrupted_one(tmp_path, pretended, tuner, done):
+    folder, expected = tmp_path / "killed", tmp_path / "whole"
+    whole = tuned(expected, tuner())
+    tuned(folder, tuner(done))
+    calls = len(pretended)
+    assert tuned(folder, tuner()) == whole
+    assert len(pretended) - calls == 6 - done  # each generation is one batch
+    for name in ("tuned.json", "curve.csv"):
+        assert (folder / name).read_text() == (expected / name).read_text()
+    assert len(read_curve(expected)) == 6
 
 
 @pytest.mark.parametrize("tuner", [slow(evolution), descents])
