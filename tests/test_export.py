@@ -65,7 +65,7 @@ def compiled(compiler, source, *options):
 # --- C -------------------------------------------------------------------------------------
 
 
-QUICK = ("rps_plus", "force_push_published", "learned_small", "unicycle", "pose")
+QUICK = ("rps_plus", "force_push_published", "learned_small", "unicycle")
 
 
 @pytest.mark.parametrize(

@@ -237,7 +237,7 @@ def test_walls_change_nothing_until_they_are_touched():
 
 
 def test_a_trial_ends_at_the_first_touch_of_the_exact_outlines():
-    task = "corridor,width=0.62,turns=1,turn_angle=1.2,lookahead=1.2"
+    task = "corridor,width=0.62,turns=1,turn_angle=1.2,length=2,lookahead=1.2"
     trace = rps_jax.push("box", task=task, skin="ideal", setting=setting_of(90.0, "mujoco"))
     data, world = trace.data, trace.world
     walls = [LineString(x) for x in data.walls.values]
