@@ -125,6 +125,7 @@ def test_concurrent_simulations_equal_separate_ones():
     assert len(requests) == max(len(x.levels) for x in separate)
 
 
+@pytest.mark.slow
 def test_a_failure_probability_of_1e_5_needs_a_twentieth_of_the_worlds():
     p, *_, trials = estimates(1e-5, 18, Rare(particles=18_000, groups=20), 8)
     assert p.std(ddof=1) / 1e-5 <= 0.2
