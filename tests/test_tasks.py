@@ -389,21 +389,6 @@ def test_walls_of_drawn_corridors_leave_their_width():
         assert away.min() > half * (1 - 1e-6)
 
 
-@pytest.mark.parametrize(
-    "points",
-    [
-        [(0.4, 0.0)],
-        [(0.4, 0.0), (np.nan, 1.0)],
-        [(0.4, 0.0), (0.4, 0.0)],
-        [(0.4, 0.0), (90.0, 0.0)],
-        [(0.4, 0.0, 1.0), (1.0, 1.0, 1.0)],
-    ],
-)
-def test_bad_waypoints_are_refused(points):
-    with refusing("task waypoints"):
-        tasks.parse_task({"kind": "path", "waypoints": points})
-
-
 def test_a_failure_says_who_touched_a_wall():
     words = [tasks.failures_of({"wall_touch": np.float32(value)}) for value in (0, 1, 2)]
     assert words == [[], ["the base touched a wall"], ["the object touched a wall"]]
