@@ -161,9 +161,9 @@ def compiled():
     monitoring.unregister_event_duration_listener(note)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def optimised():
-    """Compile the programs of a test with optimisations, if it runs longer than it compiles."""
+    """Compile with optimisations in tests of a file that run longer than they compile."""
     import jax
 
     jax.config.update("jax_disable_most_optimizations", False)

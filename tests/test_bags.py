@@ -31,7 +31,7 @@ from rps_jax.robot.skin import with_contacts
 from rps_jax.runs.push import push
 
 pytest.importorskip("mcap_ros2")
-BRIEF = setting_of(6.0)
+BRIEF = setting_of(6.0, "mujoco")
 FUSED = setting_of(10.0, "fused")
 TWIST = ("v_x", "v_y", "omega")
 

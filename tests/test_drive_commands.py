@@ -158,7 +158,7 @@ def test_a_network_with_two_actions_is_equivariant():
 def bag(tmp_path_factory):
     """Bag of a push with a differential base."""
     path = tmp_path_factory.mktemp("bag") / "push.mcap"
-    setting = Setting("mujoco", rules=Rules(horizon=12.0))
+    setting = Setting("mujoco", rules=Rules(horizon=7.0))
     Push(
         law="unicycle", robot=ROBOTS["differential"], target=(0.8, 0.8), setting=setting, bag=path
     )()

@@ -125,6 +125,7 @@ def test_concurrent_simulations_equal_separate_ones():
     assert len(requests) == max(len(x.levels) for x in separate)
 
 
+@pytest.mark.slow
 def test_a_failure_probability_of_1e_5_needs_a_twentieth_of_the_worlds():
     p, *_, trials = estimates(1e-5, 18, Rare(particles=18_000, groups=20), 8)
     assert p.std(ddof=1) / 1e-5 <= 0.2
@@ -155,6 +156,7 @@ def test_estimates_by_hand():
     assert drawn.low < 0.025 < drawn.high
 
 
+@pytest.mark.slow
 def test_the_command_compares_subset_simulation_with_drawn_worlds(tmp_path, capsys):
     domain = "wide,objects=random_cylinder,distance=0.7:0.72,bearing=-0.3:0.3"
     options = f"--law rps --engine quasistatic --domain {domain} --particles 40 --groups 4"
@@ -353,6 +355,7 @@ def test_gains_and_losses_by_hand():
     ]
 
 
+@pytest.mark.slow
 def test_the_command_of_regress_reports_known_laws(tmp_path, capsys):
     options = "--engine mujoco --horizon 5 --slots 8 --workers 1 --out"
     text = printed(capsys, f"regress --laws rps --worlds 1 {options}", tmp_path)

@@ -115,7 +115,7 @@ TRUTH = {"log_friction": np.log(0.2), "ring": 0.8, "camera_x": 8e-4, "marker_yaw
 
 
 @pytest.fixture(scope="module")
-def measured():
+def measured(optimised):
     """Noisy pushes of a known object, whose camera and markers are misplaced.
 
     One program, of 16 pushes, simulates all batches.

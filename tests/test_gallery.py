@@ -115,7 +115,7 @@ def step_backwards(params, state, obs):
 @pytest.mark.usefixtures("registries")
 def test_the_command_plots_each_mode_and_prints_a_replay_command(tmp_path, capsys):
     run = tmp_path / "run"
-    brief = setting_of(10.0, "mujoco")
+    brief = setting_of(10.0)
     rps_jax.register_law("backwards", Law(lambda params: (), step_backwards), Backwards())
     drums = parse_domain("wide,objects=random_cylinder,bearing=-0.5:0.5,gap=0.05:0.06")
     laws = {"mine law": "backwards"}

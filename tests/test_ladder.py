@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 import xarray as xr
 from helpers import (
     CYLINDERS,
@@ -122,6 +123,7 @@ def test_several_domains_are_several_ladders(tmp_path, capsys):
     assert [sweep.plan.worlds for sweep in full.sweeps.values()] == [144, 1000]
 
 
+@pytest.mark.slow
 def test_the_command_reports_information_against_success(tmp_path, capsys):
     command = f"ladder --domain wide,objects=random_cylinder --worlds 8 {QUASISTATIC}"
     command += " --laws rps_tuned dipole --horizon 20 --out"

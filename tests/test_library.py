@@ -86,7 +86,7 @@ DOMAIN_TEXTS = {"push": None, "regress": "wide", "tune_es": "wide"}  # the rest:
 
 
 @pytest.mark.parametrize(
-    "name", [x if x in ("push", "replay", "merge", "tune_es") else slow(x) for x in STORED]
+    "name", [x if x in ("push", "replay", "merge") else slow(x) for x in STORED]
 )
 def test_stored_results_are_those_of_the_call_and_of_xarray(name, run, tmp_path):
     answer, path = STORED[name](run[0], tmp_path / "run"), tmp_path / "run" / "results.nc"

@@ -65,12 +65,16 @@ def test_stored_notebooks_have_figures_and_no_errors_or_local_paths(name):
     assert not any("execution" in cell.metadata for cell in stored(name).cells)
 
 
-# These run for a minute or more; other tests call the same functions.
-LONG = ("02", "03", "04", "05", "06", "07", "08", "09", "10", "11")
-EXECUTED = [pytest.param(n, marks=[pytest.mark.slow] if n[:2] in LONG else []) for n in TEXTS]
+def test_the_code_of_the_first_notebook_runs(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    names = {}
+    for kind, source in cells(stored("01_the_law")):
+        if kind == "code":
+            exec(source, names)
 
 
-@pytest.mark.parametrize("name", EXECUTED)
+@pytest.mark.slow
+@all_notebooks
 def test_it_runs(name, pytestconfig, monkeypatch, tmp_path):
     """It runs with the compiled programs of other tests, and a tutorial in `tmp_path`."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(pytestconfig.rootpath / ".jax_cache"))

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import refusing, rps, setting_of, slow
+from helpers import SLOTS, refusing, rps, setting_of, slow
 from numpy.testing import assert_array_equal
 
 import rps_jax
@@ -122,7 +122,7 @@ def test_laws_that_ran_keep_their_results_when_another_fails(registries, tmp_pat
     register_law("fragile", Law(lambda params: (), step), Fragile())
     setting = setting_of(1.0)
     domain = "wide,objects=random_cylinder"
-    options = {"worlds": 3, "setting": setting, "out": tmp_path}
+    options = {"worlds": SLOTS, "setting": setting, "out": tmp_path}
     with (
         pytest.raises(Exception, match="no gripper"),
         pytest.warns(UserWarning, match="has the results of the laws that ran: rps"),
@@ -130,7 +130,7 @@ def test_laws_that_ran_keep_their_results_when_another_fails(registries, tmp_pat
         rps_jax.sweep(["rps", "fragile"], domain, **options)
     results = rps_jax.load(tmp_path)
     assert results.law.values.tolist() == ["rps"]
-    expected = rps_jax.sweep("rps", domain, worlds=3, setting=setting)
+    expected = rps_jax.sweep("rps", domain, worlds=SLOTS, setting=setting)
     assert_array_equal(results.base_pose, expected.base_pose)
 
 

@@ -7,7 +7,7 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import box, case, refusal, sense, setting_of
+from helpers import SHORT, box, case, refusal, sense
 from numpy.testing import assert_allclose, assert_array_equal
 from staging import push_object
 
@@ -118,9 +118,8 @@ def test_engines_agree_on_a_base_of_another_size():
 def test_a_sweep_uses_the_base_of_its_robot():
     """A base is as wide as its boards: a narrow base loses objects that the default one keeps."""
     domain = replace(DOMAINS["wide"], objects=("random_cylinder",))
-    setting = setting_of(20.0)
     wide, narrow, same = (
-        rps_jax.sweep("rps", domain, worlds=8, robot=base, setting=setting)
+        rps_jax.sweep("rps", domain, worlds=8, robot=base, setting=SHORT)
         for base in (None, Robot(half_length=0.5, half_width=0.2), Robot())
     )
     assert (narrow.base_pose.values != wide.base_pose.values).any()

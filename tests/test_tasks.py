@@ -237,7 +237,7 @@ def test_walls_change_nothing_until_they_are_touched():
 
 
 def test_a_trial_ends_at_the_first_touch_of_the_exact_outlines():
-    task = "corridor,width=0.62,turns=1,turn_angle=1.2,lookahead=1.2"
+    task = "corridor,width=0.62,turns=1,turn_angle=1.2,length=2,lookahead=1.2"
     trace = rps_jax.push("box", task=task, skin="ideal", setting=setting_of(90.0, "mujoco"))
     data, world = trace.data, trace.world
     walls = [LineString(x) for x in data.walls.values]
@@ -387,21 +387,6 @@ def test_walls_of_drawn_corridors_leave_their_width():
         half = polyline.distances(*sides[:1].T[..., None], line[:1], line[1:2]).min()
         away = polyline.distances(*sides.T[..., None], line[:-1], line[1:])
         assert away.min() > half * (1 - 1e-6)
-
-
-@pytest.mark.parametrize(
-    "points",
-    [
-        [(0.4, 0.0)],
-        [(0.4, 0.0), (np.nan, 1.0)],
-        [(0.4, 0.0), (0.4, 0.0)],
-        [(0.4, 0.0), (90.0, 0.0)],
-        [(0.4, 0.0, 1.0), (1.0, 1.0, 1.0)],
-    ],
-)
-def test_bad_waypoints_are_refused(points):
-    with refusing("task waypoints"):
-        tasks.parse_task({"kind": "path", "waypoints": points})
 
 
 def test_a_failure_says_who_touched_a_wall():

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers import decode
+from helpers import decode, slow
 
 from rps_jax import errors
 from rps_jax.world import rendering, scene, video
@@ -93,7 +93,7 @@ def test_the_contact_point_leaves_a_path_with_gaps(box, tmp_path):
     assert 0 < len(changed(blank, gap)) < len(changed(blank, whole))
 
 
-@every_camera
+@pytest.mark.parametrize("camera", [slow("above"), "oblique"])
 def test_a_partially_redrawn_image_equals_the_whole_image(box, camera):
     options = {"p_world_target": (1.0, 1.0), "size": (320, 180), "camera": camera}
     frames = np.tile(scene.initial_qpos(box), (6, 1))
