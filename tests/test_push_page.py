@@ -137,13 +137,21 @@ def drawn(browser, points):
 def test_a_drawn_path_is_a_task_of_the_command_line(paused, tmp_path):
     x = np.linspace(0.4, 5, 60)
     line = np.column_stack([x, 0.9 * np.sin(1.5 * x - 0.6)]).tolist()
+    prepare = """
+        by('base').value = arguments[0]; by('base').dispatchEvent(new Event('change'));
+        by('task').value = arguments[1]; choose()"""
     # A pixel is 1 to 2 cm. The turns of a corridor leave room for its corners.
-    for kind, task, tolerance in (("path", "path", 0.1), ("corridor", "corridor,width=1.6", 0.45)):
-        paused.execute_script("by('task').value = arguments[0]; choose()", kind)
+    kinds = (("omni", "path", 0.1), ("omni", "corridor", 0.45), ("differential", "corridor", 0.6))
+    for base, kind, tolerance in kinds:
+        paused.execute_script(prepare, base, kind)
         text, fault = drawn(paused, line)
         assert not fault
         (tmp_path / "path.json").write_text(text)
-        case = Case(task=f"{task},{tmp_path / 'path.json'}")
+        words = paused.execute_script("return by('command').textContent").split()
+        options = dict(zip(words[2::2], words[3::2], strict=True))
+        task = options["--task"].replace("path.json", str(tmp_path / "path.json"))
+        case = Case(task=task, robot=options["--robot"], law=options["--law"])
+        assert (base == "omni") == (case.base.drive == "omni")
         points = case.challenge.waypoints
         assert points == tuple(map(tuple, json.loads(text)["waypoints"]))
         assert 2 < len(points) <= MAKE["NUM_VERTICES"]
@@ -298,7 +306,8 @@ return [[x, y], [a, b]].map(of).every(([p, q]) => p > 0 && p < v.w && q > 0 && q
 def paused(browser):
     """The page with a new push to a target that is paused."""
     reset = "Object.assign(push.options, { drawn: null, route: ROUTES[0], corridor: 1.6 });"
-    browser.execute_script(reset + "by('task').value = 'reach'; choose(); play(false)")
+    reset += "by('base').value = 'omni'; by('task').value = 'reach'; choose(); play(false)"
+    browser.execute_script(reset)
     yield browser
     browser.execute_script("by('task').value = 'reach'; choose()")
 

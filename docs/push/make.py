@@ -308,6 +308,7 @@ def law_routines(base: str, name: str, title: str) -> tuple[list[Routine], dict[
         about = next(field.about for field in fields if field.name == name_in_js)
         sliders[name_in_js] = [bound.low * scale, bound.high * scale, bound.log, about]
     description = {"title": title, "base": base, "kind": kind, "heading": law.heading}
+    description["room"] = law.room
     return routines, {label: description | {"params": values, "sliders": sliders}}
 
 
@@ -389,7 +390,12 @@ def scripts() -> str:
         "PERIOD": SETTING.physics.control_period,
         "BASE": [float(x) for x in shell.half],
         "BASES": {
-            name: {"title": title, "axle": robot.axle, "half_track": float(robot.half_track)}
+            name: {
+                "title": title,
+                "robot": text,
+                "axle": robot.axle,
+                "half_track": float(robot.half_track),
+            }
             for name, (title, text) in BASES.items()
             for robot in [Robot.parse(text)]
         },

@@ -280,7 +280,8 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
       ('time',)
     """
 
-    quick: bool = option(False, hidden=True, kw_only=True)
+    _: dataclasses.KW_ONLY
+    quick: bool = option(False, hidden=True)
 
     def __post_init__(self) -> None:
         """Defer the checks of `Case` to `check`."""
