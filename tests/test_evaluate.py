@@ -99,7 +99,8 @@ def test_no_command_meets_the_worlds_of_a_tuner(monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(draws, "numbers", partial(stopped, rest))
             for name in sorted(seeded - TUNERS - SEARCHES):
-                options = {"score": {"law": "rps"}, "view": {}}.get(name, {"quick": True})
+                options = {"score": {"law": "rps"}, "view": {}, "push": {}}
+                options = options.get(name, {"quick": True})
                 with pytest.raises(StoppedError):
                     commands[name](setting=setting, **options)()
         rest.add(replace(setting, split="test").world_seed)  # in which tuners test their result
