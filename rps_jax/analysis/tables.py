@@ -108,13 +108,13 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
         low, high = statistics.cvar_interval(distance)
         known = high < np.inf
         interval = f"[{low:.2f}, {high:.2f}]" if known else "(too few worlds for an interval)"
-        most = statistics.fails_at_most(int((~success).sum()), success.size, laws)
+        bound = statistics.fails_at_most(int((~success).sum()), success.size, laws)
         rows.append(
             [
                 law,
                 *(rate(success[mask]) for mask in groups.values()),
                 rate(success),
-                f"{100 * most:.{0 if most > 0.1 else 2 if most > 0.001 else 4}f} %",
+                f"{100 * bound:.{0 if bound > 0.1 else 2 if bound > 0.001 else 4}f} %",
                 f"{statistics.cvar(distance):.2f} m {interval}",
                 *(median(trials[name].values[success], text) for name, text in medians.values()),
                 *(str(int((mode_index == statistics.modes().index(mode)).sum())) for mode in modes),

@@ -110,7 +110,7 @@ def push(slider: Slider, path: Float[Array, "B P 2"], pose: Array, steps: int = 
     The leaves of `slider` may have a leading axis B. The finger goes straight between points of a
     path, at any speed.
     """
-    own: Entries = tuple(
+    batched: Entries = tuple(
         x if jnp.ndim(x) > rank else None for x, rank in zip(slider, (2, 2, 0, 0), strict=True)
     )
 
@@ -119,7 +119,7 @@ def push(slider: Slider, path: Float[Array, "B P 2"], pose: Array, steps: int = 
         return _push(Slider(*leaves), *inputs[1:], steps=steps)
 
     with trace_one_world():
-        return jax.lax.map(push_one, (own, path, pose), batch_size=_TOGETHER)
+        return jax.lax.map(push_one, (batched, path, pose), batch_size=_TOGETHER)
 
 
 def _push(slider: Slider, path: Array, pose: Array, steps: int) -> Pushed:

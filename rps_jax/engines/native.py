@@ -498,12 +498,12 @@ def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
     Raises:
       TooLargeError: a kernel needs too much shared memory.
     """
-    fewest, most = _THREADS
+    fewest, largest = _THREADS
     if Rows.from_jaxpr(functions[0].trace.jaxpr).length > 1:
         fewest *= 2  # gradients are of too few worlds to fill a GPU
     with contextlib.suppress(TooLargeError):
         return fewest, _printed(functions, GpuWriter, fewest)
-    return most, _printed(functions, GpuWriter, most)
+    return largest, _printed(functions, GpuWriter, largest)
 
 
 def _printed(

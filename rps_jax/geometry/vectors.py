@@ -41,9 +41,9 @@ def minus(a: Number, b: Number) -> Number:
     return a if isinstance(b, float) and b == 0.0 else a - b
 
 
-def map_entries(function: Callable[..., Number], a: V, *others: Sequence[Number]) -> V:
+def map_entries(function: Callable[..., Number], a: V, *operands: Sequence[Number]) -> V:
     """Apply a function to the entries of vectors."""
-    entries: Any = tuple(map(function, a, *others))
+    entries: Any = tuple(map(function, a, *operands))
     return entries
 
 

@@ -97,9 +97,9 @@ class Trace(Trajectory):
             parts = ["never touched"]
         elif "progress" in outcome.task:
             parts.append(f"{100 * float(outcome.task['progress']):.0f} % of the path passed")
-        place, turn = (outcome.task.get(f"{x}_error", np.nan) for x in ("place", "heading"))
-        if np.isfinite(place):
-            parts.append(f"face off by {place:.3f} m and {turn:.3f} rad")
+        distance, turn = (outcome.task.get(f"{x}_error", np.nan) for x in ("place", "heading"))
+        if np.isfinite(distance):
+            parts.append(f"face off by {distance:.3f} m and {turn:.3f} rad")
         parts += tasks.failures_of(outcome.task)
         return (
             f"target ({x:g}, {y:g}) m {'reached' if outcome.success else 'not reached'} at "

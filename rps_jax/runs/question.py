@@ -227,8 +227,8 @@ class Command(Generic[T]):
         """Raise InputError for options, or numbers of the setting, that a run determines."""
 
         def values(source: Any, setting: Setting) -> dict[str, Any]:
-            own = {name: getattr(source, name) for name in names} | vars(setting)
-            return own | own.pop("rules")._asdict()
+            entries = {name: getattr(source, name) for name in names} | vars(setting)
+            return entries | entries.pop("rules")._asdict()
 
         defaults = values(type(self), Setting())
         for name, value in values(self, self._setting or Setting()).items():

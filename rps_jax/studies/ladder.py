@@ -205,10 +205,10 @@ class Score(Ladder, _ScoredLaw):
     def chosen(self) -> dict[str, LawParams]:
         label, params = resolve_law(self.law)
         scored = {label: registry.check_params(params)}
-        others, where = self.laws, self._robot_and_task
+        rivals, where = self.laws, self._robot_and_task
         with contextlib.suppress(InputError):  # no law of the package suits robot and task
-            others = others or suited_laws(*where, ("rps", "rps_plus"))
-        return scored | (registry.resolve_laws(others) if others else {}) | scored
+            rivals = rivals or suited_laws(*where, ("rps", "rps_plus"))
+        return scored | (registry.resolve_laws(rivals) if rivals else {}) | scored
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
         sections = super().sections(sweep, results, run)

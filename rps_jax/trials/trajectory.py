@@ -144,9 +144,9 @@ def rollout(
     if world.origin is not None:
         world.origin.task.check_law(params)
         for name, value in vars(world.origin.physics).items():
-            if (other := getattr(setting.physics, name)) != value:
+            if (given := getattr(setting.physics, name)) != value:
                 rule = f"the worlds were drawn with {value}; give their setting"
-                raise errors.not_allowed(name, other, rule)
+                raise errors.not_allowed(name, given, rule)
     world = soften_skins(world) if smooth else world
     world, params, start = engine.guard_derivatives((world, params, start))
     fresh = trial.start(world, params, loop.law)

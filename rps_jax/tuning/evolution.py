@@ -197,8 +197,8 @@ class TuneES(Descent):
     def check(self) -> None:
         super().check()
         for name in self.UNUSED[self.estimator]:
-            value, usual = getattr(self, name), (getattr(TuneES, name), self.QUICK.get(name))
-            if value not in usual and name != "estimator":
+            value, defaults = getattr(self, name), (getattr(TuneES, name), self.QUICK.get(name))
+            if value not in defaults and name != "estimator":
                 known = " or ".join(x for x, unused in self.UNUSED.items() if name not in unused)
                 raise errors.not_allowed(name, value, f"only the estimator {known} has it")
 

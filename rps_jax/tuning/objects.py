@@ -323,9 +323,9 @@ def _scatter(
     }
 
 
-def _distance(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _distance(pose: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the distance (n,) [m] between poses (n, 3)."""
-    return np.linalg.norm(pose[:, :2] - other[:, :2], axis=1)
+    return np.linalg.norm(pose[:, :2] - end[:, :2], axis=1)
 
 
 def errors_of(pose: np.ndarray, end: np.ndarray) -> dict[str, np.ndarray]:
@@ -394,9 +394,9 @@ def _calibrated(fitted: ObjectFit, data: Pushes) -> ObjectFit:
     alone = rest - cut + weight / np.diag(inverse)[:, None]
     off = errors_of(alone, np.zeros_like(alone))
     free = count / max(1.0, count - len(PRIOR) / 3)  # parameters take a part of each error
-    own = {name: np.sqrt(free) * np.quantile(off[name] / scatter[name], 0.9) for name in off}
+    measured = {name: np.sqrt(free) * np.quantile(off[name] / scatter[name], 0.9) for name in off}
     share = count / (count + _PSEUDO)
-    quantile = {name: (1 - share) * _QUANTILE[name] + share * own[name] for name in own}
+    quantile = {name: (1 - share) * _QUANTILE[name] + share * measured[name] for name in measured}
     return replace(fitted, quantile=quantile, nearby=(traits, weight))
 
 

@@ -49,8 +49,8 @@ def register_quantity(name: str, quantity: Quantity) -> None:
     if quantity.owner in targets and quantity.apply is None:
         errors.check_name(f"quantity of the {quantity.owner}", name, targets[quantity.owner])
     if quantity.owner == "robot" and quantity.apply is None:
-        taken = {domain.robot_field(x) for x in domain.quantities_of("robot") if x != name}
-        free = [x.name for x in fields(Robot) if x.name not in {*taken, "boards"}]
+        used = {domain.robot_field(x) for x in domain.quantities_of("robot") if x != name}
+        free = [x.name for x in fields(Robot) if x.name not in {*used, "boards"}]
         errors.check_name("quantity of the robot", name, [f"robot_{x}" for x in free])
     domain.REGISTERED.add(name)
     _publish({name: quantity})
