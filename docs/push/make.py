@@ -308,8 +308,8 @@ def law_routines(base: str, name: str, title: str) -> tuple[list[Routine], dict[
         about = next(field.about for field in fields if field.name == name_in_js)
         sliders[name_in_js] = [bound.low * scale, bound.high * scale, bound.log, about]
     description = {"title": title, "base": base, "kind": kind, "heading": law.heading}
-    description["room"] = law.room
-    return routines, {label: description | {"params": values, "sliders": sliders}}
+    description |= {"room": law.room, "params": values, "sliders": sliders}
+    return routines, {label: description}
 
 
 def values_of(tree: Any) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 import functools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from rps_jax.app.export import program as programs
 from rps_jax.app.export.program import Program
@@ -23,6 +24,8 @@ from rps_jax.trials.progress import ProgressCallback
 @dataclass(frozen=True)
 class Export(Command[Path]):
     """Export of a law with its parameters, and of the skin of a robot, to another language."""
+
+    EXAMPLES: ClassVar[Collection[str]] = ()  # files that users edit, and that stay as they are
 
     law: LawLike | None = None
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
@@ -66,9 +69,9 @@ class Export(Command[Path]):
         for name, text in texts.items():
             content = text if isinstance(text, bytes) else text.encode()
             path = out / name
-            if name == "main.c" and path.exists() and path.read_bytes() != content:
-                text = f"{path} is kept, since it differs from the example: remove it for a new one"
-                warnings.warn(text, stacklevel=2)
+            if name in self.EXAMPLES and path.exists() and path.read_bytes() != content:
+                kept = f"{path} is kept, since it differs from the example: remove it for a new one"
+                warnings.warn(kept, stacklevel=2)
             else:
                 files.write_bytes(path, content)
         return out / next(iter(texts))
@@ -77,6 +80,8 @@ class Export(Command[Path]):
 @dataclass(frozen=True)
 class ExportC(Export):
     """Write a law and a skin as one C99 header, with an example that measures itself."""
+
+    EXAMPLES = ("main.c",)
 
     def texts(self) -> Mapping[str, str | bytes]:
         """Return the header and the example."""
